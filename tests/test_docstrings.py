@@ -11,7 +11,7 @@ from support.recorded import SMALL
 
 import tfbus
 
-WITH_EXTRAS = {"tfbus.recording.load": "rosbags"}
+WITH_EXTRAS = {"tfbus.recording.recording": "rosbags"}
 """Modules whose examples need an extra, and a package of it."""
 
 EXAMPLES = ["Bus", "Buffer", "Transform", "TransformArray", "TransformBroadcaster", "TransformTree", "do_transform"]

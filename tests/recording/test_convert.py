@@ -20,8 +20,7 @@ from tfbus import RecordingError
 from tfbus.recording import Conversion, Edits, convert, load, open_recording
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.formats.transforms import RawTransform, parser_of, write_cdr, write_ros1
-from tfbus.recording.load import MAX_DETAILS
-from tfbus.recording.recording import open_storage
+from tfbus.recording.recording import MAX_DETAILS, open_storage
 from tfbus.tf_message import encode
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)

@@ -72,6 +72,14 @@ def test_a_damaged_chunk_is_one_that_is_unreadable(tmp_path: Path) -> None:
     assert (found.stamps.tolist(), found.from_headers, found.unreadable) == ([0, 3_000_000_000], True, 1)
 
 
+def test_a_cut_file_has_no_unreadable_message(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    write_mcap(path, LINES, schema=POINT, definition=b"", chunk_size=1)
+    path.write_bytes(path.read_bytes()[:-20])
+    found = header_stamps(path, "/points")
+    assert (found.stamps.tolist(), found.unreadable) == ([0, 1_500_000_000, 3_000_000_000], 0)
+
+
 def test_without_headers_the_log_times_are_taken(tmp_path: Path) -> None:
     found = header_stamps(write(tmp_path / "run.mcap", "std_msgs/msg/String", b"string data\n"), "/points")
     assert (found.stamps.tolist(), found.from_headers) == ([0, 1, 2], False)

@@ -28,7 +28,7 @@ from tfbus import (
 )
 from tfbus.recording import load, open_recording
 from tfbus.recording.formats.mcap_output import McapOutput
-from tfbus.recording.load import MAX_DETAILS, Problems, fill
+from tfbus.recording.recording import MAX_DETAILS, Problems, fill
 from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.tree import forest_of
 

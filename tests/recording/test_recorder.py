@@ -41,9 +41,8 @@ from tfbus import (
 )
 from tfbus.bus.queues import TimedBatch
 from tfbus.recording.formats.mcap_output import McapOutput
-from tfbus.recording.load import load
 from tfbus.recording.recorder import _SLICE, Recorder
-from tfbus.recording.recording import open_recording
+from tfbus.recording.recording import load, open_recording
 
 pytestmark = pytest.mark.anyio
 

@@ -190,12 +190,14 @@ def test_a_file_that_cannot_be_opened_is_unreadable(tmp_path: Path) -> None:
     assert raised.value.reason == "unreadable"
 
 
-def test_without_a_package_the_error_names_the_extra() -> None:
+def test_without_a_package_the_error_names_the_extra_and_other_formats_are_read(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("map", "base", 1)])])
     program = (
         "import sys; sys.modules['mcap'] = None\n"
         "from tfbus.recording import RecordingError, open_recording\n"
+        f"open_recording({str(SMALL)!r}).close()\n"
         "try:\n"
-        f"    open_recording({str(SMALL)!r})\n"
+        f"    open_recording({str(path)!r})\n"
         "except RecordingError as error:\n"
         "    print(error.reason, error)\n"
     )

@@ -8,7 +8,7 @@ from support.samples import moving, static
 
 from tfbus import SECOND, TransformStamped
 from tfbus.recording import load
-from tfbus.recording.load import _MAX_CANDIDATES, SpeedLimit
+from tfbus.recording.recording import _MAX_CANDIDATES, SpeedLimit
 
 
 def kept(*places: float, speed: float = 2.0) -> tuple[list[float], Counter[str]]:

@@ -1,5 +1,6 @@
 """Files that are cut, damaged or hostile: nothing but the documented errors, and whatever is missing is told."""
 
+import bz2
 import os
 import random
 import sqlite3
@@ -18,7 +19,8 @@ from support.samples import moving
 
 from tfbus import RecordingError
 from tfbus.recording import convert, examine, load, open_recording
-from tfbus.recording.load import Problems
+from tfbus.recording.formats.storage import UnfoldBudget, UnfoldError, unfold
+from tfbus.recording.recording import Problems
 from tfbus.recording.summary import summarise
 from tfbus.tf_message import encode
 
@@ -165,6 +167,35 @@ def test_what_small_chunks_describe_is_kept_up_to_a_bound(tmp_path: Path) -> Non
     # The first two are within the bound.
     assert problems == {"damaged": 3, "unfinished": 1}
     assert "the descriptions of channels take more than 67,108,864 bytes" in problems.details[0]
+
+
+@pytest.mark.thorough
+def test_all_chunks_of_a_small_file_together_unfold_to_a_bound(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    first = chunk(described(1, b"") + stored(1, encode([moving("a", "b", 1)])))
+    big = chunk(record(0x80, bytes(250 * 2**20)))
+    path.write_bytes(MAGIC + first + 7 * big + stored(1, encode([moving("b", "c", 1)])))
+    assert path.stat().st_size < 100_000
+    problems = Problems()
+    # The fifth exceeds the bound of 1 GiB, and is the last that is unfolded.
+    assert load(path, problems=problems).frames() == ["a", "b", "c"]
+    assert problems == {"damaged": 2, "unfinished": 1}
+    assert "the chunks before it hold more bytes than the bound for a file of its size" in problems.details[0]
+
+
+@pytest.mark.parametrize("kind", ["zstd", "bz2"])
+def test_a_budget_counts_what_is_unfolded_and_damaged_data_as_their_limit(kind: str) -> None:
+    folded = {"zstd": zstandard.compress, "bz2": bz2.compress}[kind](bytes(600))
+    budget = UnfoldBudget(1_000)
+    assert unfold(b"abc", "none", 10, budget=budget) == b"abc"
+    assert unfold(folded, kind, 600, budget=budget) == unfold(folded, kind, 600, budget=budget) == bytes(600)
+    with pytest.raises(UnfoldError, match="the chunks before it hold more bytes than the bound"):
+        unfold(folded, kind, 600, budget=budget)
+    budget = UnfoldBudget(1_000)
+    with pytest.raises(UnfoldError, match="cannot be decompressed"):
+        unfold(bytes(20), kind, 1_000, budget=budget)
+    with pytest.raises(UnfoldError, match="the chunks before it hold more bytes than the bound"):
+        unfold(folded, kind, 600, budget=budget)
 
 
 def test_a_chunk_that_an_index_names_twice_is_read_once(tmp_path: Path) -> None:

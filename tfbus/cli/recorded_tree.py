@@ -1,10 +1,11 @@
 """Reading a whole recording for a command, with its progress and its losses on standard error."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from tfbus.cli.arguments import DEFAULT_TOPICS, TopicOptions
 from tfbus.cli.output import format_counts, progress, warn
-from tfbus.recording.load import Problems, SpeedLimit, fill
+from tfbus.recording.recording import Problems, SpeedLimit, fill
 from tfbus.tree.tree import TransformTree
 
 
@@ -31,8 +32,13 @@ def load_tree(
     with topics.open(file) as recording, progress(recording.count, "reading") as advance:
         fill(tree, recording, problems, limit=limit, progress=advance)
         remarks, start = recording.remarks, recording.start
+    warn_of_losses(file, problems, remarks)
+    return tree, start
+
+
+def warn_of_losses(file: Path, problems: Problems, remarks: Iterable[str]) -> None:
+    """Warn of everything in a recording that was left out, and of what was not read."""
     if problems:
         warn(f"left out of {file}: {format_counts(problems)}")
     for line in (*problems.details, *remarks):
         warn(line)
-    return tree, start

@@ -11,10 +11,9 @@ from tfbus.recording.convert import Conversion, Edits, StaticTransform, convert
 from tfbus.recording.examine import examine
 from tfbus.recording.header_stamps import HeaderStamps, header_stamps
 from tfbus.recording.joint_states import load_joint_states
-from tfbus.recording.load import load
 from tfbus.recording.player import Player
 from tfbus.recording.recorder import Recorder
-from tfbus.recording.recording import RecordedMessage, RecordedTopic, Recording, open_recording
+from tfbus.recording.recording import RecordedMessage, RecordedTopic, Recording, load, open_recording
 from tfbus.recording.static_frames import load_static, save_static
 from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, Spread, summarise
 

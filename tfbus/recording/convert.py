@@ -29,24 +29,21 @@ from tfbus.recording.formats.copies import (
 )
 from tfbus.recording.formats.storage import (
     AUTHORITIES,
-    MAX_OTHER_MESSAGE,
     Channel,
     Storage,
     StoredMessage,
     UnfoldError,
     Wanted,
-    unfold,
 )
 from tfbus.recording.formats.transforms import (
-    COMPRESSED,
     ChannelDecoder,
     RawTransform,
     bounded,
+    decompressed,
     holds_transforms,
     parser_of,
 )
-from tfbus.recording.load import MAX_DETAILS
-from tfbus.recording.recording import open_storage
+from tfbus.recording.recording import MAX_DETAILS, open_storage
 from tfbus.tf_message import MalformedMessageError
 
 
@@ -134,7 +131,7 @@ class Conversion:
     problems : Counter of str
         The number of messages that were left out, by reason.
     details : list of str
-        What was lost or left out at the first places.
+        The first losses, in words.
     statics : dict of str to StaticTransform
         The last static transform of each child frame, with its new names.
     """
@@ -166,8 +163,8 @@ def convert(
 ) -> Conversion:
     """Write recordings to a new one, all messages in the order of their log times.
 
-    Transforms keep every bit of their stamps and numbers, also those that nothing would accept. Other messages, and
-    messages with transforms that nothing changes, are passed through as they are. Where the new format cannot hold
+    Transforms keep every bit of their stamps and numbers, even invalid ones. Other messages, and messages whose
+    transforms no edit changes, are passed through as they are. Where the new format cannot hold
     their encoding, they are converted between CDR and ROS 1; what cannot be converted is left out and counted.
 
     Parameters
@@ -181,7 +178,7 @@ def convert(
     topics : collection of str, optional
         The topics to write; by default all.
     edits : Edits, optional
-        What is changed in the transforms.
+        The changes to transforms.
     overwrite : bool
         Whether to replace an existing file.
     schema : {"ros", "foxglove"}
@@ -259,7 +256,7 @@ def new_file(target: Path) -> Iterator[Path]:
 
 
 class _Run:
-    """One conversion: what is wanted, and what has been done."""
+    """One conversion, and its result so far."""
 
     def __init__(self, copy: Copy, edits: Edits, topics: Collection[str] | None) -> None:
         self.result = Conversion()
@@ -276,7 +273,7 @@ class _Run:
                 latched: dict[tuple[Channel, bytes], None] = {}
                 for _, channel, payload in storage.messages(self._is_static, None, since - 1):
                     if isinstance(channel, Channel):
-                        # In the order of those that stay.
+                        # In the order of the newest copies.
                         latched.pop((channel, payload), None)
                         latched[channel, payload] = None
                 yield from ((since, channel, payload) for channel, payload in latched)
@@ -284,7 +281,7 @@ class _Run:
         yield from heapq.merge(*(each.messages(wanted, since, until) for each in storages), key=itemgetter(0))
 
     def write(self, received: int, channel: Channel | MalformedMessageError, payload: bytes) -> None:
-        """Write one message, or count why it is left out."""
+        """Write one message, or count the reason for leaving it out."""
         if isinstance(channel, MalformedMessageError):
             self.result.note(channel.reason, channel.detail)
             return
@@ -292,9 +289,7 @@ class _Run:
             if holds_transforms(channel):
                 self._write_transforms(received, channel, payload)
             else:
-                if channel.encoding == "cdr" and payload[:4] == COMPRESSED:
-                    payload = unfold(payload, "zstd", MAX_OTHER_MESSAGE)
-                self._copy.write(channel, received, payload)
+                self._copy.write(channel, received, decompressed(channel, payload))
                 self.result.messages += 1
         except MalformedMessageError as error:
             self.result.note(error.reason, error.detail)
@@ -308,11 +303,11 @@ class _Run:
     def _write_transforms(self, received: int, channel: Channel, payload: bytes) -> None:
         decoder = self._decoder(channel)
         payload = bounded(payload)
-        plain = self._copy.holds(channel) and not self._edits.changes_messages
+        unchanged = self._copy.holds(channel) and not self._edits.changes_messages
         try:
             transforms = parser_of(channel)(payload)
         except MalformedMessageError:
-            if not plain:
+            if not unchanged:
                 raise
             # It is passed through as it is.
             transforms = []
@@ -325,7 +320,7 @@ class _Run:
             self._note_statics([each for each, _ in kept])
             if self._edits.drop_static:
                 return
-        if plain:
+        if unchanged:
             self._copy.write(channel, received, payload)
         elif kept or not transforms:
             runs = tuple((name, len(list(run))) for name, run in groupby(authority for _, authority in kept))

@@ -1,4 +1,4 @@
-"""`examine`, which tells what is wrong with a recording."""
+"""`examine`, which finds the faults of a recording."""
 
 import math
 import struct
@@ -64,7 +64,7 @@ def examine(
 def _note_norms(examiner: Examiner, transforms: list[RawTransform]) -> None:
     for seconds, nanoseconds, _, child, numbers in transforms:
         norm = math.hypot(*_ROTATION.unpack_from(numbers, 24))
-        # What is not finite is refused anyway.
+        # A number that is not finite is refused anyway.
         if math.isfinite(norm):
             name = child.decode(errors="replace").lstrip("/")
             examiner.add_norm(name, seconds * SECOND + nanoseconds, norm)

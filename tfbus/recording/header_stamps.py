@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from tfbus.errors import RecordingError
 from tfbus.recording.formats.copies import MessageTypes, types_with_header
-from tfbus.recording.formats.storage import MAX_OTHER_MESSAGE, Channel, UnfoldError, unfold
-from tfbus.recording.formats.transforms import COMPRESSED
+from tfbus.recording.formats.storage import Channel, UnfoldError
+from tfbus.recording.formats.transforms import decompressed
 from tfbus.recording.recording import open_storage
 from tfbus.stamps import SECOND
 
@@ -26,7 +26,7 @@ class HeaderStamps(NamedTuple):
     from_headers: bool
     """Whether they are those of the headers; else the messages have no header, and these are their log times."""
     unreadable: int
-    """The number of messages that are damaged or too short, and left out."""
+    """The number of messages that are too short and of damaged places of the file, which are left out."""
 
 
 def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
@@ -51,7 +51,8 @@ def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
     try:
         for received, channel, payload in storage.messages(lambda each: each.topic.removeprefix("/") == name):
             if not isinstance(channel, Channel):
-                unreadable += 1
+                # The report of a file without its end stands for no message.
+                unreadable += channel.reason != "unfinished"
             elif not begins_with_header(channel):
                 from_headers = False
                 stamps.append(received)
@@ -89,8 +90,7 @@ def begins_with_header(channel: Channel) -> bool:
 
 
 def _stamp(channel: Channel, payload: bytes) -> int:
-    if payload[:4] == COMPRESSED and channel.encoding == "cdr":
-        payload = unfold(payload, "zstd", MAX_OTHER_MESSAGE)
+    payload = decompressed(channel, payload)
     if channel.encoding == "ros1":
         # Behind the number that counts the messages.
         seconds, nanoseconds = struct.unpack_from("<II", payload, 4)

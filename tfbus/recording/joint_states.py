@@ -7,8 +7,7 @@ from pathlib import Path
 from tfbus.errors import InvalidTransformError, RecordingError
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.formats.transforms import bounded
-from tfbus.recording.load import Problems
-from tfbus.recording.recording import open_storage
+from tfbus.recording.recording import Problems, open_storage
 from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.robot.model import RobotModel
 from tfbus.tf_message import MalformedMessageError

@@ -169,7 +169,7 @@ class Player:
         prefix: str = "",
         namespaces: bool = False,
     ) -> None:
-        # Wrong ones raise here, and not in `play`.
+        # Wrong topics raise here, and not in `play`.
         Selection(topics, prefix, namespaces)
         self._chosen: dict[str, Any] = {"topics": topics, "prefix": prefix, "namespaces": namespaces}
         _check_rate(rate)
@@ -276,7 +276,7 @@ class Player:
         self._stir()
 
     def _stir(self) -> None:
-        """Have the wait for the next message look again at what it waits for."""
+        """Interrupt the wait for the next message: its time may have changed."""
         if self._waiting is not None:
             self._waiting.cancel()
 
@@ -287,7 +287,7 @@ class Player:
         now = anyio.current_time()
         if self._rate != math.inf:
             passed = from_seconds(min((now - self._origin_time) * self._rate, _MAX_STEP))
-            # Never behind what was played, and never before what is waited for.
+            # Never before the last message, and never behind the next one.
             self._origin = max(self._origin, min(self._origin + passed, self._playhead))
         else:
             self._origin = self._playhead

@@ -291,7 +291,7 @@ class Recorder:
 
     def _fail(self, error: Exception) -> None:
         self.error = error
-        # What is still published is counted as dropped.
+        # Samples that are published from now on count as dropped.
         self._queue.clear()
         logging.getLogger("tfbus.recording").warning(
             "the recording %s has ended early, with %d samples in it: %s",

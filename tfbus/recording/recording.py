@@ -1,15 +1,31 @@
-"""`open_recording`, which reads the transforms of a file of ROS 1, ROS 2 or tfbus message by message, by log time."""
+"""From a file to a tree: `open_recording` gives the messages of a recording one by one, `load` inserts all of them.
 
+The first bytes of a file choose a `Storage` in `tfbus.recording.formats`, which gives the payloads of messages by log
+time. `Selection` chooses the channels. Then two ways lead from bytes to samples, and both give the same bits:
+
+* `Recording.messages` decodes one message after the other (`ChannelDecoder`), and tells what is wrong with each.
+* `Recording.blocks` gives many messages at once. `Block.columns` decodes all of them with numpy (`ColumnDecoder`), if
+  nothing in the block needs a judgement; else `Block.messages` decodes them one by one.
+
+`fill` tries the columns first, and appends them to histories that exist already. Where an edge is new or changes, each
+sample is judged: by `max_translation`, by `SpeedLimit`, and by `without_loops`. Damage raises nothing anywhere: it is
+a message without samples whose errors say what is lost, and `Problems` counts it.
+"""
+
+import logging
+import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
 from typing import Final, NamedTuple, Self, TypeAlias
 
 from tfbus.errors import InvalidTransformError, MissingRecordingError, RecordingError, pip_install
 from tfbus.frames import is_frame
-from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.geometry.stamped import MAX_TRANSLATION, Batch, TransformStamped, is_within, not_physical
 from tfbus.plain import printable
 from tfbus.recording.formats.storage import Channel, Packed, Storage, Stored, StoredMessage, blocks_of, pack
 from tfbus.recording.formats.transforms import (
@@ -20,7 +36,12 @@ from tfbus.recording.formats.transforms import (
     Columns,
     holds_transforms,
 )
+from tfbus.rows import Row
+from tfbus.stamps import SECOND, is_real
 from tfbus.tf_message import MalformedMessageError
+from tfbus.tree.cycles import NewestEdge, admit
+from tfbus.tree.forest import Forest
+from tfbus.tree.tree import TransformTree, forest_of
 
 
 class RecordedMessage(NamedTuple):
@@ -31,12 +52,12 @@ class RecordedMessage(NamedTuple):
     batch: Batch
     """The valid transforms."""
     errors: tuple[InvalidTransformError | MalformedMessageError, ...]
-    """The reason why others were refused; with ``"damaged"``, the part of the file that is lost here, and with
-    ``"unfinished"``, why messages may be missing at the end."""
+    """The reasons for refusing the other transforms. An error with the reason ``"damaged"`` says which part of the file
+    is lost here, one with ``"unfinished"`` why messages may be missing at the end."""
 
     @property
     def is_report(self) -> bool:
-        """Whether it stands for no message of the file, but for what is missing there."""
+        """Whether it stands for no message of the file, but reports a loss there."""
         return any(error.reason in ("damaged", "unfinished") for error in self.errors)
 
 
@@ -412,14 +433,14 @@ def open_recording(
     ValueError, TypeError
         If both `topics` and `namespaces` are given, or a prefix begins with a slash.
 
-    Notes
-    -----
-    The sizes that a file claims or unfolds to are bounded, and what exceeds its bound is left out and reported: 8 MiB
-    for a message with transforms, 256 MiB for any other, for a chunk (and a million messages in it) and for a value in
-    SQLite, 4 MiB for ``metadata.yaml``. A compressed file in a folder unfolds to at most 100 times its size, or 64 MiB
-    if that is more, in a nameless temporary file. An index of more than 64 MiB is not used. The descriptions of all
-    channels and types take at most 64 MiB. Messages of chunks that overlap in time are sorted in memory up to 512 MiB.
-    With all that, reading a hostile file takes at most 2 GiB of memory.
+    Notes ----- The sizes that a file claims or unfolds to are bounded, and what exceeds its bound is left out and
+    reported: 8 MiB for a message with transforms, 256 MiB for any other, for a chunk (and a million messages in it) and
+    for a value in SQLite, 4 MiB for ``metadata.yaml``. A compressed file in a folder unfolds to at most 100 times its
+    size, or 64 MiB if that is more, in a nameless temporary file. An index of more than 64 MiB is not used. The
+    descriptions of all channels and types take at most 64 MiB. All compressed chunks together unfold to at most 1,000
+    times the size of the file, or 1 GiB if that is more; the chunks behind that are left out. Messages of chunks that
+    overlap in time are sorted in memory up to 512 MiB. With all that, reading a hostile file takes at most 2 GiB of
+    memory.
 
     An SQLite file beside which a writer has left a journal is copied to a temporary folder, where SQLite undoes the
     last transaction; if the writer still runs, the file is read in its place.
@@ -458,16 +479,352 @@ def _open_storage(path: Path, folders: bool = False) -> Storage:
         first = file.read(_FIRST_BYTES)
     if not first:
         raise RecordingError("the file is empty", path=str(path), reason="empty")
-    from tfbus.recording.formats import folder, mcap, mcap_records, ros1
-
-    formats: list[tuple[bytes, Callable[[Path], Storage]]] = [
-        (mcap_records.MAGIC, mcap.McapStorage),
-        (folder.MAGIC, folder.SqliteStorage),
-        (ros1.MAGIC, ros1.Ros1Storage),
-    ]
-    for magic, storage in formats:
+    for magic, open_format in _FORMATS.items():
         if first.startswith(magic):
-            return storage(path)
+            return open_format(path)
         if magic.startswith(first):
             raise RecordingError(f"the file ends after {len(first)} bytes", path=str(path), reason="truncated")
     raise RecordingError("it is no recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)", path=str(path), reason="foreign")
+
+
+# Each format imports packages of its own, so only the one of the file is imported.
+def _open_mcap(path: Path) -> Storage:
+    from tfbus.recording.formats.mcap import McapStorage
+
+    return McapStorage(path)
+
+
+def _open_sqlite(path: Path) -> Storage:
+    from tfbus.recording.formats.folder import SqliteStorage
+
+    return SqliteStorage(path)
+
+
+def _open_bag(path: Path) -> Storage:
+    from tfbus.recording.formats.ros1 import Ros1Storage
+
+    return Ros1Storage(path)
+
+
+_FORMATS: Final[dict[bytes, Callable[[Path], Storage]]] = {
+    b"\x89MCAP0\r\n": _open_mcap,
+    b"SQLite format 3\0": _open_sqlite,
+    b"#ROSBAG V": _open_bag,
+}
+"""By the first bytes of a file."""
+
+_MAX_CANDIDATES = 16
+
+
+class SpeedLimit:
+    """Decides for each moving sample whether its frame can have moved there from the last one that was kept.
+
+    Parameters
+    ----------
+    speed : float
+        In m/s.
+
+    Attributes
+    ----------
+    dropped : Counter
+        The number of samples left out, under ``"speed"``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the speed is not a number greater than zero.
+    """
+
+    def __init__(self, speed: float) -> None:
+        if not is_real(speed):
+            raise TypeError(f"max_speed must be a number of m/s, not {speed!r}")
+        if not speed > 0:
+            raise ValueError(f"max_speed must be greater than zero, got {speed!r}")
+        self.dropped: Counter[str] = Counter()
+        self._speed = float(speed)
+        self._kept: dict[tuple[str, str], tuple[int, Row]] = {}
+        self._candidates: dict[tuple[str, str], list[TransformStamped]] = {}
+
+    def admit(self, batch: Batch) -> Batch:
+        """The samples of a batch that are kept, behind earlier ones that this batch has confirmed."""
+        kept: list[TransformStamped] = []
+        for sample in batch:
+            if sample.static:
+                kept.append(sample)
+            else:
+                kept += self._judge(sample)
+        return tuple(kept)
+
+    def undecided(self) -> Batch:
+        """At the end of all samples: the first sample of each frame that has no two samples in agreement."""
+        kept = []
+        for candidates in self._candidates.values():
+            kept.append(candidates[0])
+            self._drop(len(candidates) - 1)
+        self._candidates.clear()
+        return tuple(kept)
+
+    def _judge(self, sample: TransformStamped) -> list[TransformStamped]:
+        parent, child, stamp, row, _, _ = sample._fields
+        key = parent, child
+        last = self._kept.get(key)
+        if last is not None:
+            if not self._reaches(*last, stamp, row):
+                self._drop(1)
+                return []
+            self._kept[key] = stamp, row
+            return [sample]
+        candidates = self._candidates.setdefault(key, [])
+        for candidate in candidates:
+            if self._reaches(candidate.stamp, candidate._fields[3], stamp, row):
+                del self._candidates[key]
+                self._drop(len(candidates) - 1)
+                self._kept[key] = stamp, row
+                return [candidate, sample]
+        candidates.append(sample)
+        if len(candidates) > _MAX_CANDIDATES:
+            del candidates[0]
+            self._drop(1)
+        return []
+
+    def _reaches(self, stamp: int, row: Row, other_stamp: int, other: Row) -> bool:
+        # Samples of one stamp replace each other: no speed is known.
+        time = abs(other_stamp - stamp)
+        return time == 0 or math.dist(row[:3], other[:3]) <= self._speed * time / SECOND
+
+    def _drop(self, count: int) -> None:
+        if count:
+            self.dropped["speed"] += count
+
+
+MAX_DETAILS = 20
+
+
+class Problems(Counter[str]):
+    """The number of transforms and messages that were left out, by reason.
+
+    Attributes
+    ----------
+    details : list of str
+        The losses at the first damaged places, in words; at most `MAX_DETAILS`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.details: list[str] = []
+
+    def note(self, errors: tuple[InvalidTransformError | MalformedMessageError, ...]) -> None:
+        """Count the errors of a message."""
+        for error in errors:
+            self[error.reason] += 1
+            if isinstance(error, MalformedMessageError) and len(self.details) < MAX_DETAILS:
+                self.details.append(error.detail)
+
+    def noting(self, messages: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
+        """The same messages; their errors are counted as they pass."""
+        for message in messages:
+            self.note(message.errors)
+            yield message
+
+
+def load(
+    path: str | os.PathLike[str],
+    since: int | None = None,
+    until: int | None = None,
+    *,
+    topics: Topics = None,
+    prefix: str = "",
+    namespaces: bool = False,
+    max_speed: float | None = None,
+    problems: Counter[str] | None = None,
+    max_translation: float = MAX_TRANSLATION,
+) -> TransformTree:
+    """Read all transforms of a recording, or of a part of it, into a tree that keeps them all.
+
+    Invalid transforms, transforms that would close a loop of parents, and transforms that are further than
+    `max_translation`, are left out and counted, as are the damaged parts of a file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        As `open_recording`.
+    since, until : int, optional
+        The first and the last log time, in ns. Static transforms from before `since` are in the tree as well.
+    topics, prefix, namespaces
+        As `open_recording`.
+    max_speed : float, optional
+        In m/s. A moving sample that is further from the last one of its frame that was kept, by stamp, than this speed
+        allows, is left out and counted as ``"speed"``. If the first samples of a frame contradict each other, the first
+        one that a later one agrees with is kept.
+    problems : Counter, optional
+        Gets the number of transforms and messages that were left out, by reason. Without it, they are logged as a
+        warning, as is what was not read although it may hold transforms.
+    max_translation : float
+        The greatest magnitude of a translation, in m, at most 1e100.
+
+    Returns
+    -------
+    TransformTree
+        With ``keep=None``.
+
+    Raises
+    ------
+    RecordingError
+        If the recording cannot be read at all, or as `open_recording`.
+    ValueError, TypeError
+        If `max_speed` or `max_translation` is not greater than zero, or `max_translation` is greater than 1e100; or as
+        `open_recording`.
+
+    Examples
+    --------
+    >>> tree = load("small.bag")
+    >>> tree.chain("map", "laser")
+    ['map', 'odom', 'base_link', 'laser']
+    """
+    limit = None if max_speed is None else SpeedLimit(max_speed)
+    found = Problems()
+    tree = TransformTree(keep=None, max_translation=max_translation)
+    with open_recording(path, topics=topics, prefix=prefix, namespaces=namespaces) as recording:
+        fill(tree, recording, found, since, until, limit=limit)
+        remarks = recording.remarks
+    if problems is not None:
+        problems.update(found)
+        if isinstance(problems, Problems):
+            problems.details += found.details
+        return tree
+    logger = logging.getLogger("tfbus")
+    if found:
+        reasons = ", ".join(f"{count} x {reason}" for reason, count in found.most_common())
+        left_out = printable("; ".join([reasons, *found.details]))
+        logger.warning("left out of %s: %s", printable(os.fspath(path)), left_out)
+    for remark in remarks:
+        logger.warning("%s: %s", printable(os.fspath(path)), printable(remark))
+    return tree
+
+
+def fill(
+    tree: TransformTree,
+    recording: Recording,
+    problems: Problems,
+    since: int | None = None,
+    until: int | None = None,
+    *,
+    limit: SpeedLimit | None = None,
+    progress: Callable[[int], object] | None = None,
+) -> None:
+    """Insert the samples of a recording into a tree, and count the refused ones by reason.
+
+    Parameters
+    ----------
+    tree : TransformTree
+    recording : Recording
+    problems : Problems
+    since, until : int, optional
+        As `load`.
+    limit : SpeedLimit, optional
+    progress : callable, optional
+        Called with the number of messages in each block that has been inserted.
+    """
+    forest = forest_of(tree)
+    for block in recording.blocks(since, until):
+        columns = block.columns() if limit is None else None
+        if columns is None or not _append(forest, columns, tree.max_translation):
+            _commit(forest, block, problems, tree.max_translation, limit)
+        if progress is not None:
+            progress(len(block))
+    if limit is not None:
+        forest.commit(
+            without_loops(forest.frames, limit.undecided(), forest.names.parents, problems, tree.max_translation)
+        )
+        problems.update(limit.dropped)
+    forest.forget_changes()
+
+
+def _append(forest: Forest, columns: list[Columns], max_translation: float) -> bool:
+    """Insert the samples of a block, if no edge changes by them; returns whether that was so."""
+    together: dict[str, list[Columns]] = {}
+    for each in columns:
+        x, y, z = each.rows[:, :3].T
+        near = (x * x + y * y + z * z).max() <= max_translation**2
+        history = forest.frames.get(each.child)
+        if not near or history is None or (history.parent, history.static) != (each.parent, each.static):
+            return False
+        together.setdefault(each.child, []).append(each)
+    for child, parts in together.items():
+        first = parts[0]
+        if len(parts) == 1 and forest.can_append(first.parent, child, first.authority, first.stamps):
+            forest.append(child, first.stamps, first.rows)
+        else:
+            # Such as a stamp that comes again, or several authorities.
+            samples = [
+                (place, sample) for part in parts for place, sample in zip(part.order, _samples(part), strict=True)
+            ]
+            forest.commit(tuple(sample for _, sample in sorted(samples, key=itemgetter(0))))
+    return True
+
+
+def _samples(columns: Columns) -> Iterator[TransformStamped]:
+    for stamp, row in zip(columns.stamps.tolist(), columns.rows.tolist(), strict=True):
+        sample = TransformStamped.__new__(TransformStamped)
+        sample._fields = columns.parent, columns.child, stamp, tuple(row), columns.authority, columns.static
+        yield sample
+
+
+def _commit(
+    forest: Forest,
+    block: Block | DecodedBlock,
+    problems: Problems,
+    max_translation: float,
+    limit: SpeedLimit | None,
+) -> None:
+    for _, batch, errors in block.messages():
+        if errors:
+            problems.note(errors)
+        if limit is not None:
+            batch = limit.admit(_near(batch, problems, max_translation))
+        forest.commit(without_loops(forest.frames, batch, forest.names.parents, problems, max_translation))
+
+
+def without_loops(
+    edges: Mapping[str, NewestEdge],
+    batch: Batch,
+    parents: Container[str],
+    problems: Counter[str],
+    max_translation: float = MAX_TRANSLATION,
+) -> Batch:
+    """The batch without samples that are too far away or would close a loop of parents; these are counted.
+
+    Parameters
+    ----------
+    edges : mapping of child to its newest edge
+        Every edge has a sample, because nothing is ever removed from a recording.
+    batch : tuple of TransformStamped
+    parents : container of str
+        The frames that are a parent of one of the edges.
+    problems : Counter
+    max_translation : float
+        In m.
+    """
+    square = max_translation**2
+    for sample in batch:
+        parent, child, _, row, _, _ = sample._fields
+        edge = edges.get(child)
+        x, y, z, _, _, _, _ = row
+        # Not `>`, which is false for NaN.
+        if edge is None or edge.parent != parent or not x * x + y * y + z * z <= square:
+            break
+    else:
+        # The usual case: no child has got another parent, so there is no new loop.
+        return batch
+    accepted, refused = admit(edges, _near(batch, problems, max_translation), parents)
+    problems.update(error.reason for error in refused)
+    return accepted
+
+
+def _near(batch: Batch, problems: Counter[str], max_translation: float) -> Batch:
+    """The batch without the samples that are too far away, which are counted."""
+    far = [sample for sample in batch if not is_within(sample, max_translation)]
+    if not far:
+        return batch
+    problems.update(not_physical(sample, max_translation).reason for sample in far)
+    return tuple(sample for sample in batch if is_within(sample, max_translation))

@@ -16,8 +16,15 @@ import numpy.typing as npt
 
 from tfbus.geometry.stamped import Batch
 from tfbus.recording.formats.transforms import Columns
-from tfbus.recording.load import Problems, sound_samples
-from tfbus.recording.recording import Block, DecodedBlock, RecordedMessage, RecordedTopic, Recording
+from tfbus.recording.recording import (
+    Block,
+    DecodedBlock,
+    Problems,
+    RecordedMessage,
+    RecordedTopic,
+    Recording,
+    without_loops,
+)
 from tfbus.stamps import SECOND, STAMP_MAX, time_between, to_seconds
 
 
@@ -277,7 +284,7 @@ class RecordingSummary:
     remarks : tuple of str
         As `Recording.remarks`.
     details : tuple of str
-        What was lost at the first damaged places.
+        The losses at the first damaged places, in words.
     """
 
     path: Path
@@ -377,7 +384,7 @@ class _Counts:
             self.messages += not message.is_report
             if errors:
                 self.problems.note(errors)
-            self._add_batch(received, sound_samples(self.frames, batch, self.named, self.problems))
+            self._add_batch(received, without_loops(self.frames, batch, self.named, self.problems))
 
     def _add_batch(self, received: int, batch: Batch) -> None:
         for sample in batch:

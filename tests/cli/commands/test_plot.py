@@ -145,6 +145,14 @@ def test_an_unknown_frame_is_a_failed_lookup(recording: Path, tfbus: Command, op
     assert "'bass' is not known, did you mean 'base'?" in done.stderr
 
 
+def test_gaps_tell_what_is_lost_of_the_recording(recording: Path, tmp_path: Path, tfbus: Command) -> None:
+    recording.write_bytes(recording.read_bytes()[:-20])
+    done = tfbus("plot", recording, "--gaps", "-o", tmp_path / "a.svg")
+    assert done.returncode == 0
+    assert "left out of " in done.stderr
+    assert "its index is missing" in done.stderr
+
+
 def test_a_recording_without_transforms_has_no_gaps(tmp_path: Path, tfbus: Command) -> None:
     empty = write_mcap(tmp_path / "empty.mcap", [(0, "/tf", [])])
     check_wrong_call(tfbus("plot", empty, "--gaps", "-o", tmp_path / "a.png"), "there are no transforms")

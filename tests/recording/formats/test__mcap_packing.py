@@ -1,5 +1,7 @@
 import struct
 from collections import Counter
+from contextlib import closing
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +9,8 @@ import pytest
 from mcap.writer import CompressionType, Writer
 from support.samples import moving
 
-from tfbus.recording.formats.mcap import ChunkPacker, McapStorage, OpenChunk
+from tfbus.recording.formats.mcap import ChunkPacker, McapReading, McapStorage, OpenChunk
+from tfbus.recording.formats.mcap_records import MAGIC
 from tfbus.recording.formats.storage import Channel, ChunkPlace, Packed
 from tfbus.tf_message import encode
 
@@ -16,20 +19,44 @@ def message(number: int, received: int, payload: bytes) -> bytes:
     return struct.pack("<BQHIQQ", 5, 22 + len(payload), number, 0, received, 0) + payload
 
 
-CHANNELS = {0: Channel("/tf", "a", "cdr"), 3: Channel("/tf", "b", "cdr")}
+def record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def text(content: str) -> bytes:
+    return struct.pack("<I", len(content)) + content.encode()
+
+
+def described(number: int, kind: str) -> bytes:
+    """The schema and the channel of a number, of a type."""
+    schema = struct.pack("<H", number + 1) + text(kind) + text("") + text("")
+    return record(3, schema) + record(4, struct.pack("<HH", number, number + 1) + text("/tf") + text("cdr") + text(""))
+
+
+STATISTICS = record(11, struct.pack("<QHIIIIQQI", 0, 2, 2, 0, 0, 0, 0, 0, 0))
+FILE = (
+    MAGIC
+    + described(0, "a")
+    + described(3, "b")
+    + STATISTICS
+    + record(2, struct.pack("<QQI", len(MAGIC), 0, 0))
+    + MAGIC
+)
+"""A finished file without messages, whose channels have the numbers 0 and 3."""
 
 
 def packed(*contents: bytes, low: int = 0, high: int = 100) -> tuple[list[tuple[int, str, bytes]], Counter[int]]:
     """Log time, kind of channel or damage, and payload of the messages in some chunks; and the number of all."""
-    counts: Counter[int] = Counter()
-    chunks = [OpenChunk(ChunkPlace(5, 9, at), content) for at, content in enumerate(contents)]
-    found = []
-    for block in ChunkPacker(CHANNELS.get, lambda _: None, counts.update).pack(chunks, low, high):
-        damaged = not isinstance(block, Packed) and any(not isinstance(channel, Channel) for _, channel, _ in block)
-        assert isinstance(block, Packed) != damaged
-        for received, channel, payload in block.stored() if isinstance(block, Packed) else block:
-            found.append((received, channel.type if isinstance(channel, Channel) else channel.detail, payload))
-    return found, counts
+    with closing(McapStorage(Path("run.mcap"), BytesIO(FILE))) as storage:
+        reading = McapReading(storage, lambda _: True)
+        chunks = [OpenChunk(ChunkPlace(5, 9, at), content) for at, content in enumerate(contents)]
+        found = []
+        for block in ChunkPacker(reading).pack(chunks, low, high):
+            damaged = not isinstance(block, Packed) and any(not isinstance(channel, Channel) for _, channel, _ in block)
+            assert isinstance(block, Packed) != damaged
+            for received, channel, payload in block.stored() if isinstance(block, Packed) else block:
+                found.append((received, channel.type if isinstance(channel, Channel) else channel.detail, payload))
+        return found, reading.counts
 
 
 def test_all_messages_are_counted_and_those_of_wanted_channels_are_packed_by_time() -> None:

@@ -17,7 +17,7 @@ def test_the_index_and_the_order_of_the_file_give_the_same_messages(tmp_path: Pa
         assert [stored for block in in_sequence.in_sequence(0) for stored in block] == found
         assert (by_index.unknown, by_index.contradictions, in_sequence.unknown) == (0, set(), 0)
         # A reading in sequence has counted the messages, in chunks too.
-        assert storage._counted is not None
-        assert list(storage._counted.values()) == [50]
+        assert by_index.counts == in_sequence.counts
+        assert list(in_sequence.counts.values()) == [50]
     finally:
         storage.close()

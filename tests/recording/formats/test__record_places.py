@@ -5,8 +5,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from tfbus.recording.formats import mcap
-from tfbus.recording.formats.mcap import _FIRST_STEPS, record_places
+from tfbus.recording.formats import mcap_records
+from tfbus.recording.formats.mcap_records import _FIRST_STEPS, record_places
 
 
 def written(sizes: list[int]) -> bytes:
@@ -49,14 +49,14 @@ def test_few_of_many_records_whose_lengths_repeat_are_read_one_by_one(
             read.append(at)
             return struct.unpack_from("<Q", data, at)
 
-    monkeypatch.setattr(mcap, "_LENGTH", Length())
+    monkeypatch.setattr(mcap_records, "_LENGTH", Length())
     sizes = list(islice(cycle(lengths), 10_000))
     assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
     assert len(read) <= most
 
 
 def test_long_cycles_and_more_records_than_are_guessed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mcap, "_GUESSED", 100)
+    monkeypatch.setattr(mcap_records, "_GUESSED", 100)
     sizes = list(islice(cycle([*range(30), 7]), 1_000))
     assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
 

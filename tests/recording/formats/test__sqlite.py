@@ -19,7 +19,7 @@ from tfbus import RecordingError, TransformStamped
 from tfbus.recording import load, open_recording
 from tfbus.recording.formats.folder import _BLOCK, SqliteStorage
 from tfbus.recording.formats.storage import MAX_OTHER_MESSAGE
-from tfbus.recording.load import Problems
+from tfbus.recording.recording import Problems
 from tfbus.tf_message import encode
 
 TF = "tf2_msgs/msg/TFMessage"

@@ -12,7 +12,7 @@ from tfbus.cli._table import Column, table_lines
 from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import DEFAULT_TOPICS, CsvFlag, Duration, Flag, JsonFlag, TopicOptions, UsageError
 from tfbus.cli.output import csv_name, csv_writer, format_counts, format_seconds, progress, warn
-from tfbus.recording.load import Problems, fill
+from tfbus.recording.recording import Problems, fill
 from tfbus.tree.tree import TransformTree
 
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")

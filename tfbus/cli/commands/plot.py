@@ -9,10 +9,10 @@ from cyclopts import Parameter
 
 from tfbus.cli.arguments import Flag, UsageError
 from tfbus.cli.output import track, write_file
-from tfbus.cli.recorded_tree import load_tree
+from tfbus.cli.recorded_tree import load_tree, warn_of_losses
 from tfbus.errors import UnknownFrameError
 from tfbus.plain import printable
-from tfbus.recording.recording import open_recording
+from tfbus.recording.recording import Problems, open_recording
 
 _KINDS = ("png", "svg", "pdf")
 
@@ -67,8 +67,12 @@ def plot(
     except ImportError as error:
         raise UsageError(str(error)) from None
     if gaps:
+        problems = Problems()
         with open_recording(file) as recording:
-            reception = plots.read_reception(track(recording.messages(), recording.count, "reading"))
+            messages = problems.noting(recording.messages())
+            reception = plots.read_reception(track(messages, recording.count, "reading"))
+            remarks = recording.remarks
+        warn_of_losses(file, problems, remarks)
         for frame in frames:
             if frame not in reception:
                 raise UnknownFrameError(frame=frame, known=tuple(reception))

@@ -1,7 +1,8 @@
 """Writing messages of any topic to a new file: MCAP, a bag of ROS 1, or SQLite of ROS 2.
 
 A payload is written as it is where the format can hold its encoding. Else it is converted between CDR and ROS 1, by
-`rosbags` and the definition of its type.
+`rosbags` and the definition of its type (`MessageTypes`). Transforms keep every bit in each format: their numbers stay
+bytes, in Foxglove's ``FrameTransforms`` too, whose wire format is that of Protocol Buffers' "Encoding" page.
 """
 
 import json
@@ -17,12 +18,6 @@ from tfbus.recording.formats.mcap_output import SCHEMA, TYPE_HASH
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.formats.transforms import RawTransform, write_cdr, write_ros1
 from tfbus.tf_message import MalformedMessageError
-
-# Writing Foxglove's ``FrameTransforms`` in Protocol Buffers, bit by bit.
-#
-# The numbers of a message stay bytes, as in the other formats, so that a transform keeps every bit. The wire format is
-# that of Protocol Buffers' "Encoding" page; the numbers of the fields are those of Foxglove's schemas.
-
 
 FRAME_TRANSFORMS: Final = "foxglove.FrameTransforms"
 _VARINT, _FIXED64, _BYTES = 0, 1, 2
@@ -99,7 +94,7 @@ _HEADER_OF_ROS1: Final = "uint32 seq\ntime stamp\nstring frame_id\n"
 
 
 class MessageTypes:
-    """The types of the messages of some channels: those of ROS 2 Humble, and those that files define."""
+    """The types of messages: all of ROS 2 Humble, and the types that files define."""
 
     def __init__(self) -> None:
         from rosbags.typesys import Stores, get_typestore

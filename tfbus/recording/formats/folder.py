@@ -1,4 +1,12 @@
-"""Folders of ROS 2: one recording in several files, which may be compressed."""
+"""SQLite files of ROS 2, and folders of ROS 2: one recording in several files, which may be compressed.
+
+A writer that is killed leaves a journal beside its SQLite file, and SQLite needs it to make the file whole. SQLite
+would write into both, so it gets a copy. Where the writer may still be running, the file is read in its place, under
+SQLite's locks. Columns of SQLite hold values of any type, whatever their declaration: a timestamp that is no integer is
+counted.
+
+`FolderStorage` opens the files that ``metadata.yaml`` names, SQLite or MCAP, and merges their messages.
+"""
 
 import heapq
 import os
@@ -36,17 +44,6 @@ from tfbus.recording.formats.storage import (
     unfinished,
     unfold_file,
 )
-
-# Reading SQLite files of ROS 2, finished or not.
-#
-# A writer that is killed leaves a journal beside its file, and SQLite needs it to make the file whole. As it would
-# write into both, it gets a copy; where the writer may still be running, the file is read in its place, under SQLite's
-# locks.
-#
-# Columns of SQLite hold values of any type, whatever their declaration: a timestamp that is no integer is counted.
-
-
-MAGIC: Final = b"SQLite format 3\0"
 
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 _BLOCK: Final = 256
@@ -215,7 +212,7 @@ class SqliteStorage:
         size = 0
         try:
             for received, number, payload in self._query(f"{query} ORDER BY timestamp, id", values):
-                # A number that only SQLite takes for that of a topic is missed at the end.
+                # SQLite also finds a number of another type; the count at the end reports such a message.
                 if (channel := chosen.get(number)) is not None:
                     block.append((received, channel, payload or b""))
                     size += len(payload or b"")
@@ -239,7 +236,7 @@ def _beside(path: Path, suffix: str) -> Path:
 
 
 def _is_used(journal: Path) -> bool:
-    """Whether a journal has content; one that is no longer needed may stay, empty or with a head of zeros."""
+    """Whether a journal has content; SQLite may leave an old one, empty or with a head of zeros."""
     if not journal.is_file():
         return False
     with journal.open("rb") as file:
@@ -306,16 +303,16 @@ class FolderStorage:
         self.finished = not refused and all(file.finished for file in self._files)
 
     def _choose(self, path: Path) -> list[Path]:
-        """The files of the recording; those that are not read are noted as remarks."""
+        """The files of the recording; a remark is noted for each ignored file."""
         present = sorted(file for file in path.iterdir() if Path(file.name.removesuffix(COMPRESSED)).suffix in SUFFIXES)
         metadata = self._read_metadata(path / METADATA)
         if metadata is not None:
-            names, self._promised = metadata
-            chosen = [path / name for name in names]
+            named, self._promised = metadata
+            chosen = [path / name for name in named]
             why = f"{METADATA} does not name it"
         else:
-            plain = {file.name for file in present}
-            chosen = [file for file in present if file.name.removesuffix(COMPRESSED) not in plain - {file.name}]
+            names = {file.name for file in present}
+            chosen = [file for file in present if file.name.removesuffix(COMPRESSED) not in names - {file.name}]
             why = "the uncompressed file of the same name is there"
         self.remarks += [f"{file.name} is ignored: {why}" for file in present if file not in chosen]
         return chosen
@@ -434,7 +431,7 @@ def _open(path: Path, open_file: Callable[[Path], Storage]) -> Storage:
     if path.suffix != COMPRESSED:
         return open_file(path)
     with _unpacked(path) as file:
-        # What reads it keeps it open; nothing of it stays if the program is killed.
+        # The reader keeps the file open, and nothing of it stays if the program is killed.
         return open_file(file)
 
 

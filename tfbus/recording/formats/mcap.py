@@ -1,23 +1,29 @@
 """Reading MCAP files of tfbus, ROS 2 and Foxglove, finished or not.
 
-A finished file has an index of its chunks at its end, so only the needed chunks are read, by log time. A file whose
-writer was killed, or whose index fails its checksum, is read from its beginning, as far as possible. A chunk that fails
-its checksum is left out and reported, and reading continues behind it.
+`McapStorage` holds the file and its index; each iteration over messages is a `McapReading`; `mcap_records` parses the
+bytes. A reading takes one of three ways:
+
+* By index, packed. A finished file has an index of its chunks at its end, so only the needed chunks are read. Chunks
+  that do not overlap in time are joined, and `ChunkPacker` finds their messages with numpy.
+* By index, one by one. Where many or large chunks overlap, their messages are merged by log time.
+* In sequence. A file whose writer was killed, or whose index fails its checksum, is read from its beginning, in the
+  order of the file, as far as possible.
+
+A chunk that fails its checksum is left out and reported, and reading continues behind it.
 """
 
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
-from itertools import accumulate, chain, pairwise
+from itertools import accumulate, chain
 from operator import itemgetter
 from pathlib import Path
-from typing import IO, Final, NamedTuple, Protocol
+from typing import IO, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from mcap import records
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
@@ -30,6 +36,7 @@ from tfbus.recording.formats.mcap_records import (
     Torn,
     parse_record,
     read_records,
+    record_places,
     scan_chunks,
     split_chunk,
     split_message,
@@ -46,6 +53,7 @@ from tfbus.recording.formats.storage import (
     Packed,
     Stored,
     StoredMessage,
+    UnfoldBudget,
     Wanted,
     batches,
     in_order,
@@ -58,73 +66,6 @@ from tfbus.recording.formats.storage import (
     unfinished,
 )
 from tfbus.stamps import STAMP_MAX
-
-# `record_places`, which finds the records in the chunks of an MCAP file.
-#
-# Only the length of a record tells where the next one begins. But most recordings repeat the same few lengths, so many
-# places are guessed at once: if the first guess is right, and each record there is as long as guessed, all are right.
-
-
-_HEAD: Final = 9
-"""Bytes: the opcode and the length of what follows."""
-_LENGTH: Final = struct.Struct("<Q")
-_FIRST_STEPS: Final = 16
-"""So many records are read one by one, to find what repeats; more, if a guess was of little use."""
-_GUESSED: Final = 2**16
-"""So many places are guessed at once, roughly."""
-
-
-def record_places(data: bytes) -> npt.NDArray[np.int64]:
-    """The beginnings of all records of whole chunks, and the end of the last one.
-
-    Raises
-    ------
-    struct.error, ValueError
-        If the last record is cut off.
-    """
-    length = len(data)
-    found: list[npt.NDArray[np.int64]] = []
-    at, steps = 0, _FIRST_STEPS
-    while at < length:
-        places: list[int] = []
-        while at < length and len(places) < steps:
-            places.append(at)
-            at += _HEAD + _LENGTH.unpack_from(data, at + 1)[0]
-        found.append(np.array(places, np.int64))
-        if at < length and (cycle := _cycle([after - before for before, after in pairwise([*places, at])])):
-            guessed = _follow(data, at, cycle)
-            if len(guessed) > 1:
-                found.append(guessed[:-1])
-                at = int(guessed[-1])
-            steps = steps * 2 if len(guessed) <= steps else _FIRST_STEPS
-        else:
-            steps *= 2
-    if at != length:
-        raise ValueError("a record goes on behind the end of the chunks")
-    return np.concatenate([*found, np.array([at], np.int64)])
-
-
-def _cycle(lengths: list[int]) -> list[int] | None:
-    """The shortest cycle that the lengths have gone through at least twice."""
-    for period in range(1, len(lengths) // 2 + 1):
-        if lengths[period:] == lengths[:-period]:
-            # In phase: what comes next is what came one period before.
-            return lengths[-period:]
-    return None
-
-
-def _follow(data: bytes, at: int, cycle: list[int]) -> npt.NDArray[np.int64]:
-    """The places of successive records from `at` on, as long as their lengths go through a cycle, and the end."""
-    last = len(data) - _HEAD
-    count = min((last - at) // sum(cycle) + 1, _GUESSED // len(cycle) + 1)
-    lengths = np.tile(np.array(cycle, np.int64), max(count, 0))
-    places = at + np.cumsum(lengths) - lengths
-    places = places[: np.searchsorted(places, last, side="right")]
-    lengths = lengths[: len(places)]
-    announced = np.ndarray((max(last, 0) + 1,), "<u8", data, offset=1, strides=(1,))[places]
-    wrong = np.flatnonzero(announced != (lengths - _HEAD).astype(np.uint64))
-    right = int(wrong[0]) if len(wrong) else len(places)
-    return np.append(places[:right], at if not right else places[right - 1] + lengths[right - 1])
 
 
 class OpenChunk(NamedTuple):
@@ -139,23 +80,12 @@ class ChunkPacker:
 
     Parameters
     ----------
-    wanted : callable
-        Gives the channel with a number, None if its messages are not read.
-    register : callable
-        Gets each schema and channel in the chunks.
-    count : callable
-        Gets the number of the messages in some chunks, by the number of the channel.
+    reading : McapReading
+        Knows the wanted channels, and counts what is in the chunks.
     """
 
-    def __init__(
-        self,
-        wanted: Callable[[int], Channel | None],
-        register: Callable[[records.McapRecord], object],
-        count: Callable[[Mapping[int, int]], object],
-    ) -> None:
-        self._wanted = wanted
-        self._register = register
-        self._count = count
+    def __init__(self, reading: "McapReading") -> None:
+        self._reading = reading
         self._table: list[Channel] = []
         self._places: dict[Channel, int] = {}
 
@@ -172,25 +102,23 @@ class ChunkPacker:
                 raise ValueError("a record goes on behind the end of its chunk")
             if np.diff(firsts).max() > MAX_CHUNK_MESSAGES:
                 raise ValueError("one has too many messages")
-            numbers, received, starts, ends = scan_chunks(data, places[:-1], places[1:], self._register)
+            numbers, received, starts, ends = scan_chunks(data, places[:-1], places[1:], self._reading.register)
         except DAMAGE:
             # One by one, to find out which of them is damaged.
             yield sorted(chain.from_iterable(self._split(chunk, low) for chunk in chunks), key=itemgetter(0))
             return
         present, which, counts = np.unique(numbers, return_inverse=True, return_counts=True)
-        self._count(dict(zip(present.tolist(), counts.tolist(), strict=True)))
-        wanted = [self._place(self._wanted(number)) for number in present.tolist()]
+        self._reading.count(dict(zip(present.tolist(), counts.tolist(), strict=True)))
+        wanted = [self._place(self._reading.wanted_channel(number)) for number in present.tolist()]
         # A log time that is no stamp becomes negative.
         whole = Packed(data, self._table, np.array(wanted, np.int64)[which], received.view(np.int64), starts, ends)
         yield from in_order(whole if min(wanted, default=0) >= 0 else whole.chosen(whole.numbers >= 0), low, high)
 
     def _split(self, chunk: OpenChunk, low: int) -> list[StoredMessage]:
         try:
-            found, counts = split_chunk(chunk.content, self._wanted, self._register)
+            return self._reading.split(chunk.content)
         except DAMAGE as error:
             return lost_chunk(chunk.place, low, error)
-        self._count(counts)
-        return found
 
     def _place(self, channel: Channel | None) -> int:
         """The place of a channel in the table of packed messages; -1 for one that is not read."""
@@ -231,35 +159,20 @@ class IndexedChunk(NamedTuple):
     channels: tuple[int, ...]
 
 
-class McapSource(Protocol):
-    """The file that is read."""
-
-    size: int
-
-    @property
-    def finished(self) -> bool: ...
-
-    @property
-    def index(self) -> Sequence[IndexedChunk]: ...
-
-    def read_chunk(self, offset: int) -> Chunk: ...
-
-    def records_from(self, at: int) -> Iterator[tuple[int, int, bytes | None]]: ...
-
-    def register(self, record: records.McapRecord) -> bool: ...
-
-    def channel(self, number: int) -> Channel | None: ...
-
-    def set_counts(self, counts: Counter[int]) -> None: ...
-
-
 class McapReading:
-    """One iteration over the messages of a file.
+    """One iteration over the messages of a file, by its index or in sequence.
+
+    Parameters
+    ----------
+    storage : McapStorage
+    wants : callable
+        Whether the messages of a channel are read.
 
     Attributes
     ----------
-    wants : callable
-        Whether the messages of a channel are read.
+    wants
+    counts : Counter of int
+        All messages that were met, by the number of their channel.
     unknown : int
         Messages on channels that the file does not describe.
     contradictions : set of int
@@ -268,19 +181,20 @@ class McapReading:
         Whether a reading in sequence has come to the end of the data, which a writer marks before its index.
     """
 
-    def __init__(self, source: McapSource, wanted: Wanted) -> None:
-        self._source = source
-        self.wants = wanted
-        self._counts: Counter[int] = Counter()
+    def __init__(self, storage: "McapStorage", wants: Wanted) -> None:
+        self._storage = storage
+        self.wants = wants
+        self.counts: Counter[int] = Counter()
+        self._budget = UnfoldBudget.of_file(storage.size)
         self.unknown = 0
         self.contradictions: set[int] = set()
         self.finished_once = False
 
     def by_index(self, low: int, high: int) -> Iterator[list[StoredMessage]]:
         """The messages of all chunks that overlap the range, in the order of their log times."""
-        size = self._source.size
+        size = self._storage.size
         places, too_long = [], set()
-        for place, length, _, numbers in self._source.index:
+        for place, length, _, numbers in self._storage.index:
             # Without numbers, or with unknown ones, only reading the chunk tells what is in it.
             if place.start <= high and place.end >= low and (not numbers or any(map(self._may_be_wanted, numbers))):
                 places.append(place)
@@ -291,7 +205,7 @@ class McapReading:
             try:
                 if place.offset in too_long:
                     raise ValueError("it is behind the end of the file")
-                return self._in_chunk(self._source.read_chunk(place.offset))
+                return self.split(self._storage.read_chunk(place.offset).unfold(budget=self._budget))
             except (*DAMAGE, EndOfFile) as error:
                 return lost_chunk(place, low, error)
 
@@ -299,22 +213,22 @@ class McapReading:
 
     def packed(self, separated: list[slice], low: int, high: int) -> Iterator[Stored]:
         """The messages of parts of the index that do not overlap, several parts at once."""
-        packer = ChunkPacker(self._wanted_channel, self._register, self._count)
+        packer = ChunkPacker(self)
         chunks: list[OpenChunk] = []
         size, enough = 0, _FIRST_BLOCK
         for part in separated:
             for place, length, claimed, numbers in sorted(
-                self._source.index[part], key=lambda chunk: chunk.place.offset
+                self._storage.index[part], key=lambda chunk: chunk.place.offset
             ):
                 if place.start > high or place.end < low or (numbers and not any(map(self._may_be_wanted, numbers))):
                     continue
                 try:
-                    if place.offset + length > self._source.size:
+                    if place.offset + length > self._storage.size:
                         raise ValueError("it is behind the end of the file")
-                    read = self._source.read_chunk(place.offset)
+                    read = self._storage.read_chunk(place.offset)
                     if read.size > claimed:
                         raise ValueError(f"the index claims {claimed:,} bytes, and it has {read.size:,}")
-                    chunk = OpenChunk(place, read.unfold())
+                    chunk = OpenChunk(place, read.unfold(budget=self._budget))
                 except (*DAMAGE, EndOfFile) as error:
                     yield from packer.pack(chunks, low, high)
                     chunks.clear()
@@ -332,7 +246,7 @@ class McapReading:
         """All messages in the order of the file, up to its end; damage before `low` is reported at `low`."""
         now = low
         try:
-            for offset, opcode, content in self._source.records_from(len(MAGIC)):
+            for offset, opcode, content in self._storage.records_from(len(MAGIC)):
                 # Behind the data, schemas and channels come again, and these copies may be the damaged part.
                 self.finished_once = self.finished_once or opcode == Opcode.DATA_END
                 if self.finished_once and opcode not in (Opcode.CHUNK, Opcode.MESSAGE):
@@ -349,50 +263,55 @@ class McapReading:
         except EndOfFile as end:
             for torn in end.args:
                 yield self._in_torn(torn)
-            if self._source.finished:
+            if self._storage.finished:
                 yield [lost_message(now, "a record goes on behind the end of the file")]
-        self._source.set_counts(self._counts)
+        self._storage.set_counts(self.counts)
 
     def _in_record(self, opcode: int, content: bytes | None) -> list[StoredMessage]:
         if content is None:
             raise ValueError("it exceeds its bound" if opcode in _KINDS else f"its kind, {opcode}, is unknown")
         if opcode == Opcode.CHUNK:
-            return self._in_chunk(Chunk.parse(content))
+            return self.split(Chunk.parse(content).unfold(budget=self._budget))
         if opcode == Opcode.MESSAGE:
             received, number, payload = split_message(content)
-            self._count({number: 1})
-            channel = self._wanted_channel(number)
+            self.count({number: 1})
+            channel = self.wanted_channel(number)
             return [] if channel is None else [(received, channel, payload)]
         if record := parse_record(opcode, content):
-            self._register(record)
+            self.register(record)
         return []
 
-    def _in_chunk(self, chunk: Chunk, torn: bool = False) -> list[StoredMessage]:
-        found, counts = split_chunk(chunk.unfold(torn), self._wanted_channel, self._register, torn)
-        self._count(counts)
+    def split(self, content: bytes, torn: bool = False) -> list[StoredMessage]:
+        """The wanted messages in the content of a chunk, in its order; raises one of `DAMAGE`."""
+        found, counts = split_chunk(content, self.wanted_channel, self.register, torn)
+        self.count(counts)
         return found
 
-    def _count(self, counts: Mapping[int, int]) -> None:
-        self._counts.update(counts)
-        self.unknown += sum(count for number, count in counts.items() if self._source.channel(number) is None)
+    def count(self, counts: Mapping[int, int]) -> None:
+        """Count messages, by the number of their channel."""
+        self.counts.update(counts)
+        self.unknown += sum(count for number, count in counts.items() if self._storage.channel(number) is None)
 
     def _in_torn(self, torn: Torn) -> list[StoredMessage]:
         """The readable part of the record in which the file ends."""
         with suppress(*DAMAGE):
             if torn.opcode == Opcode.CHUNK:
-                return self._in_chunk(Chunk.parse(torn.data, torn=True), torn=True)
+                chunk = Chunk.parse(torn.data, torn=True)
+                return self.split(chunk.unfold(True, self._budget), torn=True)
         return []
 
-    def _wanted_channel(self, number: int) -> Channel | None:
-        channel = self._source.channel(number)
+    def wanted_channel(self, number: int) -> Channel | None:
+        """The channel with a number; None if its messages are not read."""
+        channel = self._storage.channel(number)
         return channel if channel is not None and self.wants(channel) else None
 
     def _may_be_wanted(self, number: int) -> bool:
-        channel = self._source.channel(number)
+        channel = self._storage.channel(number)
         return channel is None or self.wants(channel)
 
-    def _register(self, record: records.McapRecord) -> None:
-        if not self._source.register(record) and isinstance(record, (records.Channel, records.Schema)):
+    def register(self, record: records.McapRecord) -> None:
+        """Note a schema or a channel, and whether it contradicts another one of its number."""
+        if not self._storage.register(record) and isinstance(record, (records.Channel, records.Schema)):
             self.contradictions.add(record.id)
 
 
@@ -629,6 +548,7 @@ class McapStorage:
 
     def _log_times(self) -> Iterator[tuple[int, int]]:
         """First and last log time of each chunk and of each message outside of chunks, as far as the file is good."""
+        budget = UnfoldBudget.of_file(self.size)
         try:
             self._file.seek(len(MAGIC))
             for _, opcode, content in read_records(self._file, self.size):
@@ -638,13 +558,13 @@ class McapStorage:
                 elif content is not None and opcode == Opcode.CHUNK:
                     with suppress(*DAMAGE):
                         chunk = Chunk.parse(content)
-                        if chunk.end or self._times_in(chunk.unfold()):
+                        if chunk.end or self._times_in(chunk.unfold(budget=budget)):
                             yield chunk.start, chunk.end
         except EndOfFile as end:
             for torn in end.args:
                 with suppress(*DAMAGE):
                     if torn.opcode == Opcode.CHUNK:
-                        times = self._times_in(Chunk.parse(torn.data, torn=True).unfold(torn=True))
+                        times = self._times_in(Chunk.parse(torn.data, torn=True).unfold(True, budget))
                         if times:
                             yield min(times), max(times)
         except DAMAGE:

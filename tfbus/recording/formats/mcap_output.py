@@ -2,6 +2,9 @@
 
 Every write goes to the operating system at once, and each chunk is complete in itself. So flushed samples can be read
 even if the process is killed. All functions block.
+
+A transform of ROS has no authority. So each authority has a channel of its own, and so has each sequence of authorities
+within one message. The metadata of the channel hold them, under a key that other tools ignore (`Channels`).
 """
 
 import json
@@ -20,12 +23,6 @@ from tfbus.errors import InvalidTransformError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.recording.formats.storage import AUTHORITIES
 from tfbus.tf_message import encode, refusal
-
-# The channels of an MCAP file, one for each topic and authority.
-#
-# A transform of ROS has no authority. So each authority has a channel of its own, and so has each sequence of
-# authorities within one message. The metadata of the channel hold them, under a key that other tools ignore.
-
 
 MAX_CHANNELS = 1_000
 MAX_SHARED_CHANNELS = 500

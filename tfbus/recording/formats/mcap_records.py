@@ -1,13 +1,15 @@
 """The records of an MCAP file, and the messages in its chunks (MCAP's specification, sections "Records" and "Chunk").
 
-The package `mcap` parses the records that are rare. This module only splits a file into records and a chunk into
-messages: to build an object for each message would take ten times as long.
+The package `mcap` parses the rare records. This module only splits a file into records and a chunk into messages: to
+build an object for each message would take ten times as long. `split_chunk` goes from record to record and tells what
+is wrong; `record_places` and `scan_chunks` find the same messages in many whole chunks at once, with numpy.
 """
 
 import struct
 import zlib
 from collections.abc import Callable, Iterator
 from io import BytesIO
+from itertools import pairwise
 from typing import IO, Final, NamedTuple
 
 import numpy as np
@@ -24,6 +26,7 @@ from tfbus.recording.formats.storage import (
     MAX_OTHER_MESSAGE,
     Channel,
     StoredMessage,
+    UnfoldBudget,
     UnfoldError,
     unfold,
 )
@@ -57,7 +60,7 @@ _SKIPPED: Final = frozenset(
 _BOUND: Final = {Opcode.CHUNK: MAX_CHUNK, Opcode.MESSAGE: MAX_OTHER_MESSAGE}
 _PRIVATE: Final = 0x80
 
-_HEAD: Final = np.dtype(
+_MESSAGE_HEAD: Final = np.dtype(
     {"names": ("channel", "received"), "formats": ("<u2", "<u8"), "offsets": (9, 15), "itemsize": 31}
 )
 
@@ -97,7 +100,7 @@ _READ: Final[dict[int, Callable[[bytes], records.McapRecord]]] = {
 
 
 class Torn(NamedTuple):
-    """The part of a record that there is of one that goes on behind the end of the file."""
+    """The beginning of a record that goes on behind the end of the file."""
 
     opcode: int
     data: bytes
@@ -132,17 +135,17 @@ class Chunk(NamedTuple):
             raise ValueError(f"{stored} bytes are announced, and there are {len(data) - at}")
         return cls(start, end, size, crc, compression, data[at : at + stored])
 
-    def unfold(self, torn: bool = False) -> bytes:
+    def unfold(self, torn: bool = False, budget: UnfoldBudget | None = None) -> bytes:
         """The records in the chunk; with `torn`, as far as they can be decompressed.
 
         Raises
         ------
         UnfoldError
-            If the data are damaged, or larger than `MAX_CHUNK`.
+            If the data are damaged, or larger than `MAX_CHUNK`, or nothing is left of the budget.
         """
         if self.size > MAX_CHUNK:
             raise UnfoldError(f"it claims {self.size:,} bytes, and {MAX_CHUNK:,} is the bound")
-        content = unfold(self.data, self.compression, self.size, torn)
+        content = unfold(self.data, self.compression, self.size, torn, budget)
         if len(content) < self.size and not torn:
             raise UnfoldError(f"it claims {self.size:,} bytes, and holds {len(content):,}")
         if len(content) == self.size and self.crc and zlib.crc32(content) != self.crc:
@@ -266,6 +269,68 @@ def split_chunk(
     return found, counts
 
 
+_FIRST_STEPS: Final = 16
+"""So many records are read one by one, to find what repeats; more, if a guess was of little use."""
+_GUESSED: Final = 2**16
+"""So many places are guessed at once, roughly."""
+
+
+def record_places(data: bytes) -> npt.NDArray[np.int64]:
+    """The beginnings of all records of whole chunks, and the end of the last one.
+
+    Only the length of a record tells where the next one begins. But most recordings repeat the same few lengths, so
+    many places are guessed at once: if the first guess is right, and each record is as long as guessed, all are right.
+
+    Raises
+    ------
+    struct.error, ValueError
+        If the last record is cut off.
+    """
+    length = len(data)
+    found: list[npt.NDArray[np.int64]] = []
+    at, steps = 0, _FIRST_STEPS
+    while at < length:
+        places: list[int] = []
+        while at < length and len(places) < steps:
+            places.append(at)
+            at += RECORD.size + _LENGTH.unpack_from(data, at + 1)[0]
+        found.append(np.array(places, np.int64))
+        if at < length and (cycle := _cycle([after - before for before, after in pairwise([*places, at])])):
+            guessed = _follow(data, at, cycle)
+            if len(guessed) > 1:
+                found.append(guessed[:-1])
+                at = int(guessed[-1])
+            steps = steps * 2 if len(guessed) <= steps else _FIRST_STEPS
+        else:
+            steps *= 2
+    if at != length:
+        raise ValueError("a record goes on behind the end of the chunks")
+    return np.concatenate([*found, np.array([at], np.int64)])
+
+
+def _cycle(lengths: list[int]) -> list[int] | None:
+    """The shortest cycle that the lengths have gone through at least twice."""
+    for period in range(1, len(lengths) // 2 + 1):
+        if lengths[period:] == lengths[:-period]:
+            # In phase: each length comes again one period later.
+            return lengths[-period:]
+    return None
+
+
+def _follow(data: bytes, at: int, cycle: list[int]) -> npt.NDArray[np.int64]:
+    """The places of successive records from `at` on, as long as their lengths go through a cycle, and the end."""
+    last = len(data) - RECORD.size
+    count = min((last - at) // sum(cycle) + 1, _GUESSED // len(cycle) + 1)
+    lengths = np.tile(np.array(cycle, np.int64), max(count, 0))
+    places = at + np.cumsum(lengths) - lengths
+    places = places[: np.searchsorted(places, last, side="right")]
+    lengths = lengths[: len(places)]
+    announced = np.ndarray((max(last, 0) + 1,), "<u8", data, offset=1, strides=(1,))[places]
+    wrong = np.flatnonzero(announced != (lengths - RECORD.size).astype(np.uint64))
+    right = int(wrong[0]) if len(wrong) else len(places)
+    return np.append(places[:right], at if not right else places[right - 1] + lengths[right - 1])
+
+
 class ChunkMessages(NamedTuple):
     """The messages of some chunks, in columns."""
 
@@ -300,7 +365,7 @@ def scan_chunks(
     One of `DAMAGE`.
     """
     # For the head of the last message, whatever its length.
-    padded = np.frombuffer(data + bytes(_HEAD.itemsize), np.uint8)
+    padded = np.frombuffer(data + bytes(_MESSAGE_HEAD.itemsize), np.uint8)
     opcodes = padded[begins]
     is_message = opcodes == _MESSAGE_OPCODE
     if not is_message.all():
@@ -311,5 +376,5 @@ def scan_chunks(
         begins, ends = begins[is_message], ends[is_message]
     if (ends - begins < _MESSAGE_RECORD.size).any():
         raise ValueError("a message is too short")
-    heads = np.ndarray((len(data) + 1,), _HEAD, padded, strides=(1,))[begins]
+    heads = np.ndarray((len(data) + 1,), _MESSAGE_HEAD, padded, strides=(1,))[begins]
     return ChunkMessages(heads["channel"], heads["received"], begins + _MESSAGE_RECORD.size, ends)

@@ -1,4 +1,7 @@
-"""Reading bags of ROS 1, finished or not.
+"""Reading bags of ROS 1, finished or not (the format "ROSBAG V2.0").
+
+A record of a bag is a header, which is a list of named fields, and data; each of the two has its length before it. The
+first half of this module parses records, and the messages in chunks; `Ros1Storage` is the second half.
 
 The index at the end of a bag lists its chunks. Without it, because the writer was killed or the file was cut, the
 chunks are found one after the other; behind damage, by the bytes that begin each of them. A chunk that is damaged is
@@ -26,6 +29,7 @@ from tfbus.recording.formats.storage import (
     ChunkPlace,
     DescriptionBudget,
     StoredMessage,
+    UnfoldBudget,
     Wanted,
     in_words,
     lost_message,
@@ -36,11 +40,6 @@ from tfbus.recording.formats.storage import (
     unfold,
 )
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN
-
-# The records of a bag of ROS 1, and the messages in its chunks (the format "ROSBAG V2.0").
-#
-# A record is a header, which is a list of named fields, and data; each of the two has its length before it.
-
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = range(2, 8)
 _KNOWN: Final = range(2, 8)
@@ -200,20 +199,20 @@ class Content(NamedTuple):
     """The reason why the rest is missing; empty if nothing is."""
 
 
-def read_chunk(file: IO[bytes], record: Record, torn: bool = False) -> bytes:
+def read_chunk(file: IO[bytes], record: Record, torn: bool = False, budget: UnfoldBudget | None = None) -> bytes:
     """The records in a chunk; with `torn`, as far as they can be decompressed.
 
     Raises
     ------
     One of `DAMAGE`
-        If they cannot be decompressed, or are larger than `MAX_CHUNK`.
+        If they cannot be decompressed, or are larger than `MAX_CHUNK`, or nothing is left of the budget.
     """
     size = number_in(record.fields, b"size")
     if size > MAX_CHUNK:
         raise ValueError(f"it claims {size:,} bytes, and {MAX_CHUNK:,} is the bound")
     data = record.read(file, MAX_CHUNK)
     # While a chunk is written, its header claims nothing.
-    content = unfold(data, text_in(record.fields, b"compression"), size or MAX_CHUNK, torn)
+    content = unfold(data, text_in(record.fields, b"compression"), size or MAX_CHUNK, torn, budget)
     if not torn and len(content) != size:
         raise ValueError(f"it claims {size:,} bytes, and holds {len(content):,}")
     return content
@@ -279,7 +278,6 @@ class _Layout:
         return header[:a], header[b:c], header[d:]
 
 
-MAGIC: Final = b"#ROSBAG V"
 _VERSION: Final = b"#ROSBAG V2.0\n"
 
 
@@ -391,9 +389,10 @@ class Ros1Storage:
             and (chunk.counts is None or any(self._may_be_wanted(number, wanted) for number in chunk.counts))
         }
         counts: Counter[int] = Counter()
+        budget = UnfoldBudget.of_file(self._size)
 
         def read_place(place: ChunkPlace) -> list[StoredMessage]:
-            content = self._content(place.offset, torn=chunks[place].counts is None)
+            content = self._content(place.offset, chunks[place].counts is None, budget)
             counts.update(number for _, number, _ in content.messages)
             channel_of = self._numbered.get
             found: list[StoredMessage] = [
@@ -419,13 +418,13 @@ class Ros1Storage:
         if since is None and until is None:
             known = {chunk.offset for chunk in chunks.values()}
             for chunk in self._chunks:
-                # What was not read is in an index.
+                # A chunk that was not read has an index.
                 if chunk.offset not in known:
                     counts.update(chunk.counts or {})
             self._counted = counts
             promised = self._promised
             if promised is not None:
-                # Also where another connection of the same topic is not described.
+                # Even if another connection of the same topic is not described.
                 yield from shortfalls(
                     now,
                     {channel: promised[number] for number, channel in self._numbered.items() if wanted(channel)},
@@ -459,7 +458,7 @@ class Ros1Storage:
                 if not any(missing) and len({chunk.offset for chunk in self._chunks}) == len(self._chunks):
                     return True
         except DAMAGE:
-            # Then the chunks tell all of it.
+            # Then the chunks are searched.
             pass
         self._chunks.clear()
         self._numbered.clear()
@@ -481,12 +480,13 @@ class Ros1Storage:
     def _find_chunks(self) -> None:
         """Find the chunks of a file without an index, and the connections of their messages."""
         at = len(_VERSION)
+        budget = UnfoldBudget.of_file(self._size)
         cause: Exception | None = None
         while at < self._size:
             try:
                 record = read_record(self._file, at)
                 if record.kind == CHUNK:
-                    at = self._add_chunk(record)
+                    at = self._add_chunk(record, budget)
                     continue
                 if record.end > self._size:
                     raise CutOffError("a record goes on behind the end of the file")
@@ -494,7 +494,7 @@ class Ros1Storage:
             except DAMAGE as error:
                 following = find_chunk(self._file, at + 1)
                 if following is None:
-                    # As every file that was cut, it ends inside of a record.
+                    # A file that was cut ends inside of a record.
                     cause = error
                     break
                 self._damage.append(f"nothing can be read from byte {at} to byte {following}: {in_words(error)}")
@@ -506,7 +506,7 @@ class Ros1Storage:
             raise RecordingError(f"it cannot be read as a bag of ROS 1: {why}", path=str(self._path), reason="damaged")
         raise RecordingError("the file ends before its first message", path=str(self._path), reason="truncated")
 
-    def _add_chunk(self, record: Record) -> int:
+    def _add_chunk(self, record: Record, budget: UnfoldBudget) -> int:
         """Note a chunk, with the times and counts of the index records behind it; returns the offset of what follows.
 
         Raises
@@ -535,7 +535,7 @@ class Ros1Storage:
                 ends = [min([first, *ends]), max([last, *ends])]
             at = following.end
         if not counts or not counts.keys() <= self._numbered.keys():
-            content = self._content(record.offset, torn)
+            content = self._content(record.offset, torn, budget)
             ends = ends or [received for received, _, _ in content.messages]
             if not ends and content.damage:
                 # It has no log time, so it is told at the start.
@@ -546,7 +546,7 @@ class Ros1Storage:
 
     # Reading
 
-    def _content(self, offset: int, torn: bool) -> Content:
+    def _content(self, offset: int, torn: bool, budget: UnfoldBudget) -> Content:
         """The content of a chunk; its connections are registered. With `torn`, its end may be missing."""
         try:
             record = read_record(self._file, offset)
@@ -554,9 +554,9 @@ class Ros1Storage:
                 return Content([], [], "there is no chunk")
             if torn and (record.size == 0 or record.end > self._size):
                 record = record._replace(size=self._size - record.data)
-                content = split_chunk(read_chunk(self._file, record, torn=True))._replace(damage="")
+                content = split_chunk(read_chunk(self._file, record, True, budget))._replace(damage="")
             else:
-                content = split_chunk(read_chunk(self._file, record))
+                content = split_chunk(read_chunk(self._file, record, budget=budget))
         except DAMAGE as error:
             return Content([], [], in_words(error))
         for fields, data in content.connections:

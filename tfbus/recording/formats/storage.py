@@ -1,4 +1,14 @@
-"""`Packed`, many messages in one piece of memory: numpy decodes them without a Python object for each."""
+"""The parts that all formats share: the bounds of a hostile file, channels and messages, and their order by log time.
+
+A `Storage` is an open file. It gives `StoredMessage`, one by one, or `Packed`: many messages in one piece of memory,
+which numpy decodes without a Python object for each. Nothing here knows a format, or what a message holds.
+
+* Bounds. A few bytes can claim, or unfold to, more than any machine holds. A size beyond its bound is not read, and its
+  place is reported. `tfbus.recording.open_recording` tells these numbers to users. `unfold` decompresses up to a bound.
+* Losses. `lost_message`, `unfinished` and `shortfalls` make the reports that stand in place of missing messages.
+* Order. Chunks of a file may overlap in time. `merge_chunks` sorts their messages; `separate` finds the parts of an
+  index that can be sorted by themselves, and `in_order` sorts packed messages.
+"""
 
 import bz2
 from bisect import bisect_left
@@ -14,12 +24,6 @@ import numpy.typing as npt
 
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tf_message import MalformedMessageError
-
-# The bounds of every size that a file claims or unfolds to.
-#
-# A few bytes can claim, or unfold to, more than any machine holds. What exceeds a bound is not read, and its place is
-# reported. `tfbus.recording.open_recording` tells these numbers to users.
-
 
 MIB: Final = 2**20
 
@@ -46,6 +50,8 @@ MAX_METADATA: Final = 4 * MIB
 """The size in bytes of ``metadata.yaml``."""
 MAX_FACTOR: Final = 100
 MIN_UNPACKED: Final = 64 * MIB
+MAX_UNFOLD_FACTOR: Final = 1_000
+MIN_UNFOLDED: Final = 1_024 * MIB
 
 
 class DescriptionBudget:
@@ -59,6 +65,24 @@ class DescriptionBudget:
         self._left -= DESCRIPTION + sum(map(len, texts))
         if self._left < 0:
             raise ValueError(f"the descriptions of channels take more than {MAX_DESCRIBED:,} bytes, which is the bound")
+
+
+class UnfoldBudget:
+    """Counts the bytes that one reading unfolds from compressed chunks: 208 bytes of bzip2 take three seconds.
+
+    Parameters
+    ----------
+    left : int
+        How many bytes may still be unfolded; the chunk that exceeds them is the last.
+    """
+
+    def __init__(self, left: int) -> None:
+        self.left = left
+
+    @classmethod
+    def of_file(cls, size: int) -> "UnfoldBudget":
+        """The budget for a file of a size: 1,000 times as much, or 1 GiB if that is more."""
+        return cls(max(MIN_UNFOLDED, MAX_UNFOLD_FACTOR * size))
 
 
 def max_unpacked(packed: int) -> int:
@@ -104,7 +128,7 @@ Wanted = Callable[[Channel], bool]
 
 
 def lost_message(received: int, detail: str) -> StoredMessage:
-    """A message in place of those that cannot be read."""
+    """The report that stands in place of messages that cannot be read."""
     return received, MalformedMessageError("damaged", detail), b""
 
 
@@ -122,17 +146,16 @@ def unfinished(received: int, read: Counter[Channel], why: str) -> StoredMessage
     read : Counter of Channel
         The number of messages that were read of each channel.
     why : str
-        What shows it.
+        The evidence.
     """
     count = sum(number for channel, number in read.items() if isinstance(channel, Channel))
     return received, MalformedMessageError("unfinished", f"{count:,} messages were read of the file; {why}"), b""
 
 
 def in_words(error: Exception) -> str:
-    """The fault that an error of a parser tells: what Python and others word for programmers is told in other words."""
+    """The error of a parser in words for people: only a `ValueError` has them already."""
     if isinstance(error, UnicodeDecodeError):
         return "a text in it is no text"
-    # `struct.error`, `KeyError` and the like have no words for people.
     return str(error) if isinstance(error, ValueError) else "it ends inside of a record, or a record is damaged"
 
 
@@ -204,7 +227,7 @@ class Storage(Protocol):
     complete : bool
         Whether `channels` has all channels and all counts; if not, only reading the whole file would tell.
     remarks : sequence of str
-        What a user should know about the choice of files, such as those that were ignored.
+        Notes for a user on the choice of files, such as ignored ones.
     """
 
     @property
@@ -323,7 +346,7 @@ class UnfoldError(ValueError):
     """Compressed bytes that are damaged, or unfold to more than they may."""
 
 
-def unfold(data: bytes, compression: str, limit: int, torn: bool = False) -> bytes:
+def unfold(data: bytes, compression: str, limit: int, torn: bool = False, budget: UnfoldBudget | None = None) -> bytes:
     """Decompress bytes.
 
     Parameters
@@ -335,20 +358,30 @@ def unfold(data: bytes, compression: str, limit: int, torn: bool = False) -> byt
         The greatest size of the result, in bytes.
     torn : bool
         Whether the data may end too early; then the result is what they unfold to up to there.
+    budget : UnfoldBudget, optional
+        Counts the result down; damaged data count as `limit`.
 
     Raises
     ------
     UnfoldError
-        If the data are damaged or end too early, the result exceeds `limit`, or the compression is unknown.
+        If the data are damaged or end too early, the result exceeds `limit`, the compression is unknown, or nothing is
+        left of the budget.
     """
     if compression in ("", "none"):
         return _within(data, limit)
     if compression not in _UNFOLD:
         raise UnfoldError(f"the compression {compression!r} is unknown")
+    if budget is not None and budget.left <= 0:
+        raise UnfoldError("the chunks before it hold more bytes than the bound for a file of its size")
+    size = limit
     try:
         unfolded, complete = _UNFOLD[compression](data, limit + 1)
+        size = len(unfolded)
     except (OSError, RuntimeError, ValueError, EOFError, MemoryError) as error:
         raise UnfoldError(f"it cannot be decompressed: {error}") from None
+    finally:
+        if budget is not None:
+            budget.left -= size
     if not torn and not complete and len(unfolded) <= limit:
         raise UnfoldError("its compressed data end too early")
     return _within(unfolded, limit)

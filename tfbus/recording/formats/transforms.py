@@ -1,9 +1,15 @@
-"""Decoding many messages at once, with numpy.
+"""From the payloads of messages to transforms, in three ways.
 
-Most messages of a channel differ only in their stamps and numbers: the same frames are at the same bytes. Such messages
-are stacked to a matrix of bytes, and each transform of the message becomes two slices of it. What does not fit, or may
-be invalid, is left to `ChannelDecoder`, which decodes one message after the other and tells what is wrong with it. Both
-give the same bits.
+* `RawTransform`, `parser_of` and the writers keep the numbers of a transform as bytes: nothing is checked or
+  normalised, so a transform passes from one format to another without a change of any bit. The layout of a ROS message
+  is a sequence of numbers and strings; in CDR each is aligned to its size (see `tfbus.tf_message`); in ROS 1 nothing is
+  aligned, strings have no NUL, and a header begins with a sequence number.
+* `ChannelDecoder` decodes one message to samples, and tells what is wrong with each. Payloads that are not in CDR are
+  converted to it first.
+* `ColumnDecoder` decodes many messages at once, with numpy. Most messages of a channel differ only in their stamps and
+  numbers: the same frames are at the same bytes. So messages of one size are stacked to a matrix of bytes, and each
+  transform of the message becomes two slices of it. It gives the same bits as `ChannelDecoder`, or None for a block
+  with anything unusual, or that may be invalid; then `ChannelDecoder` takes the block.
 """
 
 import json
@@ -19,18 +25,18 @@ import numpy.typing as npt
 from tfbus.errors import pip_install
 from tfbus.frames import is_frame
 from tfbus.geometry.stamped import TransformStamped, renamed
-from tfbus.recording.formats.storage import AUTHORITIES, MAX_MESSAGE, Channel, Packed, UnfoldError, unfold
+from tfbus.recording.formats.storage import (
+    AUTHORITIES,
+    MAX_MESSAGE,
+    MAX_OTHER_MESSAGE,
+    Channel,
+    Packed,
+    UnfoldError,
+    unfold,
+)
 from tfbus.rows import NORM_TOLERANCE, ROUNDING
 from tfbus.stamps import SECOND
 from tfbus.tf_message import MAX_NAME, Decoded, MalformedMessageError, Tag, decode
-
-# Transforms of stored messages as they are in the file, bit by bit, and messages of them.
-#
-# Nothing is checked or normalised here: the numbers stay bytes, so that a transform can pass from one format to another
-# without a change. The layout of a ROS message is a sequence of numbers and strings; in CDR each is aligned to its size
-# (see `tfbus.tf_message`), in ROS 1 nothing is aligned, strings have no NUL, and a header begins with a sequence
-# number.
-
 
 TF_TYPES: Final = frozenset(("tf2_msgs/msg/TFMessage", "tf2_msgs/TFMessage", "tf/msg/tfMessage", "tf/tfMessage"))
 FOXGLOVE_TYPES: Final = frozenset(
@@ -88,6 +94,13 @@ def bounded(payload: bytes) -> bytes:
         return unfold(payload, "zstd" if payload[:4] == COMPRESSED else "", MAX_MESSAGE)
     except UnfoldError as error:
         raise MalformedMessageError("oversized" if "bound" in str(error) else "encoding", str(error)) from None
+
+
+def decompressed(channel: Channel, payload: bytes) -> bytes:
+    """A payload of any type, decompressed if the recorder has compressed it; raises `UnfoldError`."""
+    if channel.encoding == "cdr" and payload[:4] == COMPRESSED:
+        return unfold(payload, "zstd", MAX_OTHER_MESSAGE)
+    return payload
 
 
 def write_cdr(transforms: Sequence[RawTransform]) -> bytes:
@@ -254,6 +267,7 @@ def _raw(seconds: int, nanoseconds: int, parent: str, child: str, numbers: Seque
 
 
 Run = tuple[str, int]
+"""An authority, and the number of successive transforms that it sent."""
 
 
 class ChannelDecoder:
@@ -282,7 +296,7 @@ class ChannelDecoder:
         self.prefix = prefix
         self.authorities = _authorities(channel)
         self._count = sum(count for _, count in self.authorities)
-        self._plain = channel.encoding == "cdr" and not channel.type.endswith("FrameTransform")
+        self._is_cdr = channel.encoding == "cdr" and not channel.type.endswith("FrameTransform")
         self._parse = parser_of(channel)
         self._names: dict[tuple[str, str], tuple[str, str]] = {}
 
@@ -294,7 +308,7 @@ class ChannelDecoder:
         MalformedMessageError
         """
         payload = bounded(payload)
-        if not self._plain:
+        if not self._is_cdr:
             payload = write_cdr(self._parse(payload))
         order: Literal["little", "big"] = "little" if payload[1:2] == b"\1" else "big"
         count = int.from_bytes(payload[4:8], order)
@@ -346,7 +360,7 @@ def _authorities(channel: Channel) -> tuple[Run, ...]:
 Stamps = npt.NDArray[np.int64]
 
 _LARGE: Final = 1e9
-"""m; whether a longer translation is valid, the slow path decides."""
+"""m; `ChannelDecoder` decides whether a longer translation is valid."""
 _MAX_LAYOUTS: Final = 10_000
 _MAX_STRUCTURES: Final = 64
 """Of one channel and one size of messages."""
