@@ -127,16 +127,20 @@ class _AtTheDoor(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Wait for the head, if there is room for one more connection."""
         self._transport = transport
-        self._timer = asyncio.get_running_loop().call_later(HEAD_TIME, self._transport.abort)
+        self._timer = asyncio.get_running_loop().call_later(HEAD_TIME, self.end)
         self._guarded.connections.add(self)
         if len(self._guarded.connections) > MAX_CONNECTIONS:
             self._guarded.refuse_connection()
-            self._transport.abort()
+            self.end()
 
     def connection_lost(self, error: Exception | None) -> None:  # noqa: ARG002 - asyncio's signature
         """Make room for another one."""
         self._timer.cancel()
         self._guarded.connections.discard(self)
+
+    def end(self) -> None:
+        """End the connection at once."""
+        self._transport.abort()
 
     def data_received(self, data: bytes) -> None:
         """Judge the head as soon as it is there."""
@@ -175,6 +179,11 @@ class _Guarded(viser.infra.WebsockServer):
     connections: set[_AtTheDoor]
     refused_connections = 0
 
+    def end_connections(self) -> None:
+        """End the connections, which viser ends only as far as it serves them; in viser's thread."""
+        for connection in self.connections:
+            connection.end()
+
     def refuse_connection(self) -> None:
         """Count a connection for which there is no room; the first is told."""
         self.refused_connections += 1
@@ -204,12 +213,13 @@ class Server(viser.ViserServer):
 
     Attributes
     ----------
+    door : WebDoor
     refused : int
         Messages of browsers that were refused.
     """
 
     def __init__(self, host: str, port: int, door: WebDoor) -> None:
-        self._door = door
+        self.door = door
         self.refused = 0
         super().__init__(host, port, verbose=False)
         if not self._websock_server.guarded:
@@ -224,7 +234,7 @@ class Server(viser.ViserServer):
     @_websock_server.setter
     def _websock_server(self, server: Any) -> None:
         server.__class__ = _Guarded
-        server.door = self._door
+        server.door = self.door
         server.connections = set()
         server._message_class = _Messages(self, server._message_class)
         self.__dict__["_websockets"] = server
@@ -234,6 +244,12 @@ class Server(viser.ViserServer):
         """Connections for which there was no room."""
         found: int = self._websock_server.refused_connections
         return found
+
+    def stop(self) -> None:
+        """Stop serving; it waits for viser's thread."""
+        with suppress(RuntimeError):
+            self.get_event_loop().call_soon_threadsafe(self._websock_server.end_connections)
+        super().stop()
 
     def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002 - viser's signature
         """Refuse: viser would pass the page on through a server on the internet."""
