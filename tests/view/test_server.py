@@ -29,15 +29,6 @@ def test_the_page_comes_from_the_loopback_and_nothing_is_printed(capfd: pytest.C
     assert capfd.readouterr() == ("", "")
 
 
-def test_taken_ports_are_passed_over() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        server = start_server("127.0.0.1", taken.getsockname()[1])
-        try:
-            assert server.get_port() > taken.getsockname()[1]
-        finally:
-            stop_server(server)
-
-
 def test_the_port_after_the_last_one_is_not_tried() -> None:
     try:
         taken = socket.create_server(("127.0.0.1", 65_535))
