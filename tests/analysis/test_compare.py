@@ -1,4 +1,7 @@
+""""""
+
 import math
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +11,7 @@ from hypothesis import strategies as st
 from support.samples import moving, static, tree_of
 
 from tfbus import SECOND, DisconnectedError, Transform, TransformStamped, TransformTree
-from tfbus.analysis import compare
+from tfbus.analysis import Alignment, PoseErrors, Statistics, compare
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 MS = SECOND // 1_000
@@ -173,3 +176,19 @@ def test_the_errors_are_those_of_evo(tmp_path: Path, seed: int, align: bool, sca
     theirs = metric.get_all_statistics()
     for key in ("rmse", "mean", "median", "std", "min", "max"):
         assert getattr(statistics, key) == pytest.approx(theirs[key], abs=1e-9)
+
+
+number = st.floats(-10.0, 10.0)
+CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]])
+
+
+def test_a_mirrored_set_is_rotated_and_not_mirrored() -> None:
+    found = Alignment.between(CORNERS, CORNERS * [1.0, 1.0, -1.0])
+    assert np.linalg.det(found.transform.matrix()[:3, :3]) == pytest.approx(1.0)
+
+
+def test_statistics_are_those_of_the_values() -> None:
+    errors = PoseErrors(np.arange(4), np.array([1.0, 2.0, 3.0, 6.0]), np.zeros(4))
+    translation, rotation = errors.statistics()
+    assert astuple(translation) == pytest.approx((12.5**0.5, 3.0, 2.5, 3.5**0.5, 1.0, 6.0))
+    assert rotation == Statistics(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

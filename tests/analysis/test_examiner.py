@@ -1,12 +1,17 @@
+""""""
+
 import math
 import random
+from dataclasses import fields
 from typing import Any
 
+import numpy as np
 import pytest
-from support.samples import moving, static
+from support.samples import moving, static, tree_of
 
-from tfbus import SECOND, Finding, Transform, TransformStamped
+from tfbus import SECOND, Finding, Transform, TransformStamped, diagnose
 from tfbus.analysis import Examiner, Limits
+from tfbus.analysis.examiner import ADVICE, MovingSamples
 
 MS = SECOND // 1_000
 
@@ -43,12 +48,6 @@ def test_a_translation_that_cannot_be_is_found_and_is_no_jump() -> None:
     assert found == {}
 
 
-def test_a_static_translation_that_cannot_be_is_found() -> None:
-    found = examine([static("base", "laser", 1e9), static("base", "laser", 1e9)])
-    assert facts(found.pop(("translation", "laser"))) == (2, None, 1e9, None)
-    assert found == {}
-
-
 def test_a_jump_is_beyond_the_bound_or_far_beyond_what_the_frame_usually_does() -> None:
     samples = drive(speed=0.1)
     # From 0.1 m/s to 3 m/s and back: far below the bound.
@@ -73,12 +72,6 @@ def test_a_turn_rate_is_exact_for_small_angles_and_large_ones(angle: float) -> N
     finding = examine(samples, turn_rate=angle * 0.999)["turn", "base"]
     assert (finding.count, finding.first) == (2, SECOND)
     assert finding.worst == pytest.approx(angle)
-
-
-def test_a_change_of_sign_of_the_quaternion_is_no_turn() -> None:
-    one, other = Transform(), Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, -1.0))
-    samples = [TransformStamped("odom", "base", k * SECOND, (one, other)[k % 2]) for k in range(10)]
-    assert examine(samples, turn_rate=1e-6) == {}
 
 
 def test_another_parent_is_no_jump_but_is_told() -> None:
@@ -205,3 +198,91 @@ def test_a_frame_that_is_sent_as_moving_and_never_moves_is_a_hint() -> None:
     assert ("never moves", "box") not in examine([*still, static("a", "box", 2.0)])
     assert not drive(10)[0].static
     assert not any(finding.is_hint for finding in examine(drive(10), delay=-80 * MS).values())
+
+
+def test_a_tree_is_examined_with_its_senders_and_parents() -> None:
+    drive = [moving("odom", "base", k * SECOND, float(k), "odometry") for k in range(10)]
+    tree = tree_of(static("base", "laser"), *drive, keep=None)
+    assert diagnose(tree) == []
+    tree.insert(moving("odom", "base", 10 * SECOND, 1e10, "slam"))
+    tree.insert(static("x", "y"))
+    assert [(each.kind, each.frame, each.count, each.first) for each in diagnose(tree)] == [
+        ("disconnected", None, 2, None),
+        ("two authorities", "base", 1, 10 * SECOND),
+        ("translation", "base", 1, 10 * SECOND),
+    ]
+    assert [each.kind for each in diagnose(tree, Limits(speed=0.5)) if each.frame == "base"][-1] == "jump"
+
+
+def test_each_sample_has_its_own_sender_even_if_it_came_late() -> None:
+    tree = tree_of(*(moving("odom", "base", k * SECOND, float(k), "odometry") for k in range(0, 10, 2)), keep=None)
+    tree.insert_many([moving("odom", "base", k * SECOND, float(k), "slam") for k in (3, 7)])
+    found = [(each.kind, each.frame, each.count, each.first) for each in diagnose(tree)]
+    assert found == [("two authorities", "base", 4, 3 * SECOND)]
+
+
+def test_only_the_window_is_examined() -> None:
+    tree = tree_of(moving("a", "b", 0, 1e10), *(moving("a", "b", k * SECOND) for k in range(11, 15)))
+    assert diagnose(tree) == []
+
+
+ROW = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_without_arrivals_the_order_is_not_judged() -> None:
+    stamps, none = np.array([3, 2, 1]) * 10**9, np.zeros(3, np.int64)
+    samples = MovingSamples("base", stamps, np.array([ROW] * 3), none, none, None)
+    assert list(samples.findings(Limits())) == []
+    received = stamps + 5 * 10**9
+    late = MovingSamples("base", stamps, np.array([ROW] * 3), none, none, received)
+    assert [(finding.kind, finding.count) for finding in late.findings(Limits())] == [("stamps go back", 2)]
+
+
+def test_a_rate_breaks_down_where_fewer_than_half_of_the_samples_come() -> None:
+    expected: list[tuple[int, list[str]]] = [(5, []), (4, ["rate"])]
+    for left, kinds in expected:
+        # Ten samples in each tenth of 100 s, and fewer in the fifth one, at even distances.
+        counts = [10, 10, 10, 10, left, 10, 10, 10, 10, 10]
+        seconds = [10 * tenth + 10 * number / count for tenth, count in enumerate(counts) for number in range(count)]
+        stamps = (np.array([*seconds, 100.0]) * 10**9).astype(np.int64)
+        none = np.zeros(len(stamps), np.int64)
+        samples = MovingSamples("base", stamps, np.array([ROW] * len(stamps)), none, none, None)
+        found = list(samples.findings(Limits()))
+        assert [finding.kind for finding in found] == kinds
+        # The fifth tenth begins after 40 s.
+        assert {stamp for finding in found for stamp in (finding.first, finding.at)} <= {40 * 10**9}
+
+
+@pytest.mark.parametrize(("moves", "kinds"), [(19, []), (20, ["jump"])])
+def test_a_step_stands_out_among_twenty_and_not_among_fewer(moves: int, kinds: list[str]) -> None:
+    # 1 cm every second, and 10 m at last.
+    x = np.append(np.arange(moves) * 0.01, 10.0)
+    rows = np.column_stack((x, np.zeros((len(x), 5)), np.ones(len(x))))
+    stamps, none = np.arange(len(x)) * 10**9, np.zeros(len(x), np.int64)
+    samples = MovingSamples("base", stamps, rows, none, none, None)
+    assert [found.kind for found in samples.findings(Limits())] == kinds
+
+
+def test_a_finding_says_which_frame_what_how_often_the_worst_and_when() -> None:
+    finding = Finding("jump", "base", 1_234, 1_500_000_000, 12.3456, "m/s", "moves faster than it can", 2_000_000_000)
+    assert str(finding) == ("'base': moves faster than it can, 1,234 x, worst 12.35 m/s at 2.000 s, first at 1.500 s")
+    assert finding.advice == ADVICE["jump"]
+
+
+def test_what_is_not_known_is_left_out() -> None:
+    assert str(Finding("disconnected", None, 2, None, None, "", "separate trees")) == "separate trees, 2 x"
+
+
+@pytest.mark.parametrize("kind", ADVICE)
+def test_every_kind_has_an_advice_of_one_line(kind: str) -> None:
+    assert ADVICE[kind]
+    assert "\n" not in ADVICE[kind]
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Limits)])
+@pytest.mark.parametrize(
+    ("value", "error"), [(0.0, ValueError), (-1.0, ValueError), ("1", TypeError), (True, TypeError)]
+)
+def test_a_limit_is_a_number_greater_than_zero(name: str, value: Any, error: type[Exception]) -> None:
+    with pytest.raises(error, match=name):
+        Limits(**{name: value})

@@ -71,6 +71,7 @@ BOUNDS = [
     "_aio.web_door.MAX_HEAD",
     "_aio.web_door.HEAD_TIME",
     "links.foxglove.MAX_CONNECTIONS",
+    "view.server.MAX_CONNECTIONS",
     "view.server.CAPACITY",
     "view.page.EVENTS_KEPT",
     "view.page._MATCHES",

@@ -1,10 +1,14 @@
+""""""
+
 import numpy as np
 import pytest
 from support.samples import moving, over, static, tree_of
 
 from tfbus import SECOND, Transform, TransformStamped, TransformTree
 from tfbus.errors import UnknownFrameError
-from tfbus.plot.plots import read_series
+from tfbus.plot import read_series, sparklines
+from tfbus.plot.plots import read_reception
+from tfbus.recording import RecordedMessage
 
 
 def test_the_angles_are_roll_pitch_and_yaw_in_degrees() -> None:
@@ -56,3 +60,44 @@ def test_a_single_sample_is_a_series_at_its_stamp() -> None:
     series = read_series(tree, "map", "base", samples=2)
     assert series.stamps.tolist() == [5, 5]
     assert series.translations[:, 0].tolist() == [1.0, 1.0]
+
+
+def test_each_coordinate_has_a_line_from_its_least_to_its_greatest_value() -> None:
+    series = read_series(tree_of(*over("map", "base", (0, 7 * SECOND), speed=1e-9)), "map", "base")
+    lines = sparklines(series, width=8).split("\n")
+    assert lines[0] == "base in map, 0.000 s to 7.000 s"
+    assert lines[1] == "    x  ▁▂▃▄▅▆▇█  0.000 to 7.000 m"
+    assert lines[2] == "    y  ▁▁▁▁▁▁▁▁  0.000 to 0.000 m"
+    assert [line.split()[0] for line in lines[1:]] == ["x", "y", "z", "roll", "pitch", "yaw"]
+    assert lines[6].endswith("deg")
+
+
+def test_there_is_a_blank_where_there_is_no_answer() -> None:
+    tree = tree_of(*over("map", "base", (0, 2 * SECOND)), static("world", "anchor"), keep=None)
+    tree.insert_many([moving("world", "base", 4 * SECOND, 1.0), moving("world", "base", 6 * SECOND, 2.0)])
+    assert sparklines(read_series(tree, "world", "base", samples=7), width=7).split("\n")[1] == (
+        "    x      ▁▅█  1.000 to 2.000 m"
+    )
+
+
+def test_a_line_has_at_least_one_letter() -> None:
+    series = read_series(tree_of(*over("map", "base", (0, SECOND))), "map", "base")
+    with pytest.raises(ValueError, match="letter"):
+        sparklines(series, width=0)
+    assert "▁" in sparklines(series, width=1)
+
+
+def test_each_frame_has_its_stamps_and_the_times_of_their_arrival() -> None:
+    messages = [
+        RecordedMessage(5 * SECOND, (moving("map", "b", 4 * SECOND), static("b", "lidar")), ()),
+        RecordedMessage(7 * SECOND, (moving("map", "b", 6 * SECOND), moving("map", "a", 7 * SECOND)), ()),
+        RecordedMessage(8 * SECOND, (moving("map", "b", 6 * SECOND),), ()),
+    ]
+    reception = read_reception(messages)
+    assert list(reception) == ["a", "b", "lidar"]
+    assert reception["b"].stamps.tolist() == [4 * SECOND, 6 * SECOND, 6 * SECOND]
+    assert reception["b"].received.tolist() == [5 * SECOND, 7 * SECOND, 8 * SECOND]
+    assert reception["b"].periods.tolist() == [2.0]
+    assert reception["b"].delays.tolist() == [1.0, 1.0, 2.0]
+    assert [reception[frame].static for frame in ("a", "b", "lidar")] == [False, False, True]
+    assert reception["lidar"].periods.tolist() == reception["lidar"].delays.tolist() == []

@@ -17,7 +17,6 @@ from tfbus import (
     RobotModel,
     Transform,
     TransformStamped,
-    TransformTree,
 )
 
 UP = (0.0, 0.0, 1.0)
@@ -69,14 +68,6 @@ def test_fixed_joints_are_static_and_all_carry_stamp_authority_and_prefix() -> N
     assert samples[0].transform == Transform((0.0, 0.0, 1.0))
 
 
-def test_the_transforms_are_the_fixed_ones_and_then_the_moving_ones() -> None:
-    model = gripper()
-    assert model.transforms({"left": 0.25}, 1, "me", "r1/") == [
-        *model.fixed_transforms(1, "me", "r1/"),
-        *model.moving_transforms({"left": 0.25}, 1, "me", "r1/"),
-    ]
-
-
 def test_joints_without_a_position_are_left_out() -> None:
     model = gripper(follower=Mimic("left"))
     assert xs(model.transforms({}, 0)) == {}
@@ -87,12 +78,6 @@ def test_positions_of_fixed_and_of_unknown_joints_are_ignored() -> None:
     model = gripper()
     assert model.transforms({"mount": 9.0, "elbow": math.nan}, 0) == model.transforms({}, 0)
     assert model.unknown_joints({"mount": 9.0, "elbow": 0.0, "left": 0.0}) == ["elbow"]
-
-
-def test_transforms_do_not_change_the_positions_and_can_be_repeated() -> None:
-    model, positions = gripper(), {"left": 0.25}
-    assert model.transforms(positions, 0) == model.transforms(positions, 0)
-    assert positions == {"left": 0.25}
 
 
 # Mimicking
@@ -247,11 +232,6 @@ def test_an_invalid_robot_is_refused_with_the_element(links: Any, joints: list[J
     assert str(caught.value) == message
 
 
-def test_a_name_that_is_not_a_str_is_a_type_error() -> None:
-    with pytest.raises(TypeError, match="a frame name must be a str"):
-        RobotModel("r", [5], [])  # type: ignore[list-item]
-
-
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=2, max_size=4))
 def test_only_links_that_form_one_tree_are_a_robot(edges: list[tuple[int, int]]) -> None:
     """Against the obvious rule: one link reaches every other in exactly one way."""
@@ -297,12 +277,6 @@ def test_a_model_comes_from_the_text_of_a_urdf() -> None:
     assert sample == TransformStamped("base", "hook", 7, Transform((2.0, 0.0, 3.5)))
 
 
-def test_a_urdf_with_an_invalid_robot_is_refused_with_the_element() -> None:
-    with pytest.raises(InvalidRobotError) as caught:
-        RobotModel.from_urdf('<robot name="r"><link name="a"/><link name="b"/></robot>')
-    assert caught.value.element == '<robot name="r">'
-
-
 # The real thing
 
 
@@ -341,15 +315,6 @@ def test_the_fixed_joints_of_a_pr2_are_where_the_real_robot_state_publisher_put_
     assert (model.name, model.root, len(model.links), len(model.joints)) == ("pr2", "base_footprint", 83, 82)
     assert_equal_to_1e_9(model.fixed_transforms(0), pr2.recorded().static)
     assert capfd.readouterr() == ("", "")
-
-
-@pr2.needed
-def test_a_pr2_makes_one_tree_of_its_83_frames() -> None:
-    model = RobotModel.from_urdf(pr2.URDF)
-    tree = TransformTree()
-    tree.insert_many(model.transforms(model.zeros(), 5))
-    assert set(tree.frames()) == set(model.links)
-    assert all(tree.can_transform("base_footprint", link, 5) for link in model.links)
 
 
 def test_the_repr_is_one_line_with_links_and_moving_joints() -> None:

@@ -1,20 +1,22 @@
+""""""
+
 import logging
 import math
-from collections import Counter
+import struct
 from typing import Any
 
 import anyio
 import numpy as np
-import numpy.typing as npt
 import pytest
-from support import pr2
+from hypothesis import given
+from hypothesis import strategies as st
 from support.asking import Asked, settle
+from support.joint_messages import KIND, TYPES, joint_state
 from support.samples import static
 
 from tfbus import (
     Buffer,
     Bus,
-    BusClosedError,
     InvalidTransformError,
     Joint,
     Mimic,
@@ -26,6 +28,8 @@ from tfbus import (
     TransformStamped,
     from_seconds,
 )
+from tfbus.robot.joint_state_message import decode_joint_state
+from tfbus.tf_message import MalformedMessageError
 
 pytestmark = pytest.mark.anyio
 
@@ -57,19 +61,6 @@ def test_the_constructor_publishes_the_fixed_joints_once_as_statics() -> None:
     robot.publish({"swing": 0.0, "rope": 1.0})
     assert [sample.child for sample in got[1]] == ["boom", "hook", "shadow"]
     assert not any(sample.static for sample in got[1])
-
-
-def test_a_buffer_that_joins_later_gets_the_fixed_joints_too() -> None:
-    bus = Bus(SimulatedClock())
-    RobotStatePublisher(bus, CRANE)
-    assert Buffer(bus).lookup_nowait("boom", "lamp").transform.translation == (0.5, 0.0, 0.0)
-
-
-def test_a_robot_without_fixed_joints_publishes_nothing_at_first() -> None:
-    bus = Bus(SimulatedClock())
-    got = batches_of(bus)
-    RobotStatePublisher(bus, RobotModel("r", ["a", "b"], [Joint("j", "continuous", "a", "b")])).publish({"j": 1.0})
-    assert [[sample.child for sample in batch] for batch in got] == [["b"]]
 
 
 def test_a_message_is_one_batch_with_its_own_stamp_and_by_default_with_the_clocks() -> None:
@@ -183,13 +174,6 @@ def test_nothing_is_published_or_counted_if_one_position_is_bad() -> None:
     assert robot.statistics() == RobotStatistics(messages=0, unknown_joints=0, violations={})
 
 
-def test_an_empty_message_moves_nothing() -> None:
-    bus = Bus(SimulatedClock())
-    robot = RobotStatePublisher(bus, CRANE)
-    robot.publish_state([], [])
-    assert robot.statistics().messages == 1
-
-
 def test_a_refusal_of_the_bus_is_raised() -> None:
     bus = Bus(SimulatedClock())
     bus.publish(static("lamp", "boom"))
@@ -211,47 +195,6 @@ def test_a_prefix_with_a_leading_slash_is_refused_before_anything_is_sent(prefix
     assert bus.statistics().samples == 0
 
 
-def test_a_closed_bus_refuses_the_robot_and_its_messages() -> None:
-    bus = Bus(SimulatedClock())
-    robot = RobotStatePublisher(bus, CRANE)
-    bus.close()
-    with pytest.raises(BusClosedError):
-        robot.publish({"rope": 1.0})
-    with pytest.raises(BusClosedError):
-        RobotStatePublisher(bus, CRANE)
-
-
-@pr2.needed
-@pytest.mark.thorough
-def test_the_grippers_of_a_pr2_are_where_the_recorded_transforms_of_the_real_robot_put_them() -> None:
-    model = RobotModel.from_urdf(pr2.URDF)
-    recorded = pr2.recorded()
-    with Bus(SimulatedClock()) as bus, Buffer(bus, keep=None) as buffer:
-        robot = RobotStatePublisher(bus, model)
-        for state in recorded.states:
-            robot.publish_state(state.names, state.positions, state.stamp)
-        for stamp, moving in recorded.moving.items():
-            edges = {child: (parent, t) for (parent, child), t in {**recorded.static, **moving}.items()}
-            for tip in ("r_gripper_tool_frame", "l_gripper_l_finger_tip_link", "wide_stereo_optical_frame"):
-                expected: npt.NDArray[np.float64] = np.eye(4)
-                frame = tip
-                while frame in edges:
-                    frame, parent_from_frame = edges[frame]
-                    expected = parent_from_frame.matrix() @ expected
-                found = buffer.lookup_nowait("base_footprint", tip, stamp).transform.matrix()
-                np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
-        counted = robot.statistics()
-    assert (counted.messages, counted.unknown_joints) == (598, 2 * 598)
-    limits = {joint.name: (joint.lower, joint.upper) for joint in model.joints if joint.lower is not None}
-    beyond = [
-        name
-        for state in recorded.states
-        for name, position in zip(state.names, state.positions, strict=True)
-        if name in limits and np.clip(position, *limits[name]) != position
-    ]
-    assert counted.violations == Counter(beyond) != {}
-
-
 def test_a_publisher_that_drops_goes_on_whatever_edges_others_publish() -> None:
     bus = Bus(SimulatedClock())
     model = RobotModel(
@@ -264,3 +207,59 @@ def test_a_publisher_that_drops_goes_on_whatever_edges_others_publish() -> None:
     bus.publish(static("b", "a", authority="stranger"))
     robot.publish({"turn": 0.5})
     assert bus.statistics().rejected == {"cycle": 3}
+
+
+@pytest.mark.parametrize("names", [[], ["a"], ["a", "bcd", "efghijk"]])
+def test_all_encodings_are_those_of_rosbags(names: list[str]) -> None:
+    positions = {name: float(at) + 0.5 for at, name in enumerate(names)}
+    cdr = joint_state(1_500_000_001, positions)
+    assert decode_joint_state(cdr, ros1=False) == (1_500_000_001, positions)
+    big_endian = joint_state(1_500_000_001, positions, little_endian=False)
+    assert decode_joint_state(big_endian, ros1=False) == (1_500_000_001, positions)
+    assert decode_joint_state(bytes(TYPES.cdr_to_ros1(cdr, KIND)), ros1=True) == (1_500_000_001, positions)
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+@given(data=st.data())
+def test_any_bytes_are_positions_or_malformed(ros1: bool, data: st.DataObject) -> None:
+    payload = bytearray(joint_state(1, {"shoulder": 0.5, "elbow": 1.0}))
+    for place in data.draw(st.lists(st.integers(0, len(payload) - 1), max_size=3)):
+        payload[place] = data.draw(st.integers(0, 255))
+    try:
+        decode_joint_state(bytes(payload[: data.draw(st.integers(0, len(payload)))]), ros1)
+    except MalformedMessageError as error:
+        assert error.reason
+
+
+@pytest.mark.parametrize("positions", [{}, {"a": 0.5}])
+def test_names_without_positions_are_refused(positions: dict[str, float]) -> None:
+    cdr = joint_state(1, positions, more_names=["b", "c"])
+    for payload, ros1 in ((cdr, False), (bytes(TYPES.cdr_to_ros1(cdr, KIND)), True)):
+        with pytest.raises(MalformedMessageError) as caught:
+            decode_joint_state(payload, ros1)
+        names = len(positions) + 2
+        assert caught.value.reason == "positions"
+        assert caught.value.detail == f"there are {names} names, and {len(positions)} positions"
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_a_message_that_ends_before_its_last_position_is_truncated(ros1: bool) -> None:
+    payload = joint_state(1, {"shoulder": 0.5, "elbow": 1.0})
+    if ros1:
+        payload = bytes(TYPES.cdr_to_ros1(payload, KIND))
+    end = payload.index(struct.pack("<d", 1.0)) + 8
+    assert decode_joint_state(payload[:end], ros1) == (1, {"shoulder": 0.5, "elbow": 1.0})
+    for length in range(4 if ros1 else 8, end):
+        with pytest.raises(MalformedMessageError) as caught:
+            decode_joint_state(payload[:length], ros1)
+        assert caught.value.reason == "truncated"
+
+
+@pytest.mark.parametrize("count", [6, 2**31])
+def test_a_count_that_no_message_can_hold_is_refused_at_once(count: int) -> None:
+    # The header is followed by 20 bytes, and each name has at least 4 for its length.
+    payload = b"\0\1\0\0" + struct.pack("<iII", 1, 2, 1) + b"\0" * 4 + struct.pack("<I", count)
+    with pytest.raises(MalformedMessageError, match=f"cannot hold {count} names"):
+        decode_joint_state(payload, ros1=False)
+    with pytest.raises(MalformedMessageError, match="are too few"):
+        decode_joint_state(payload[:-4] + struct.pack("<I", 5), ros1=False)

@@ -1,6 +1,7 @@
 import math
 import socket
-from queue import Queue
+import sys
+from types import FrameType
 from typing import Any
 
 import anyio
@@ -10,14 +11,11 @@ import pytest
 
 pytest.importorskip("viser", reason="the live page needs viser")
 
-import msgspec
-import viser
+from anyio.lowlevel import checkpoint
 from support.browsers import Browser, in_browser
 from support.processes import free_ports
 from support.samples import moving, over, static
-from support.viser_pages import CAMERA
-from websockets.sync.client import connect
-from websockets.typing import Subprotocol
+from support.viser_pages import CLICK, PageClient, on_page
 
 from tfbus import (
     LATEST,
@@ -25,17 +23,16 @@ from tfbus import (
     Buffer,
     Bus,
     BusClosedError,
-    FrameAdded,
     InvalidRobotError,
     InvalidTransformError,
     PointCloud,
     SimulatedClock,
     Transform,
     TransformBroadcaster,
+    TransformStamped,
     TransformTree,
 )
 from tfbus.view import View
-from tfbus.view.screen import Screen, Sight
 
 pytestmark = pytest.mark.anyio
 
@@ -43,17 +40,25 @@ pytestmark = pytest.mark.anyio
 class Shown:
     """A bus on a simulated clock, and a page of it."""
 
-    def __init__(self, start: int = 100 * SECOND) -> None:
+    def __init__(self, *batch: TransformStamped, start: int = 100 * SECOND) -> None:
         self.clock = SimulatedClock(start)
         self.bus = Bus(self.clock)
         self.buffer = Buffer(self.bus)
+        self.bus.publish(batch)
+
+    def page(self, rate: float = 1_000.0, **options: Any) -> View:
+        return View(self.bus, self.buffer, 0, rate=rate, **options)
+
+    def publish(self, *batch: TransformStamped) -> None:
+        """Publish from the thread of a browser."""
+        anyio.from_thread.run_sync(self.bus.publish, batch)
 
 
 # The life of a page
 
 
 @pytest.mark.every_loop
-async def test_a_page_is_served_on_the_loopback_until_the_end() -> None:
+async def test_a_page_is_served_on_the_loopback_until_the_end(capfd: pytest.CaptureFixture[str]) -> None:
     shown = Shown()
     async with View(shown.bus, shown.buffer, 0) as view:
         assert view.address.startswith("http://127.0.0.1:")
@@ -62,16 +67,9 @@ async def test_a_page_is_served_on_the_loopback_until_the_end() -> None:
             answer = await client.get(view.address)
         assert answer.status_code == 200
         port = int(view.address.rpartition(":")[2])
-    assert view.address == ""
+    assert (view.address, capfd.readouterr()) == ("", ("", ""))
     with socket.create_server(("127.0.0.1", port)):
         pass
-
-
-async def test_it_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
-    shown = Shown()
-    async with View(shown.bus, shown.buffer, 0):
-        pass
-    assert capfd.readouterr() == ("", "")
 
 
 async def test_a_port_that_is_taken_gives_way_to_the_next_one() -> None:
@@ -119,98 +117,306 @@ async def test_a_page_outlives_its_bus() -> None:
             assert (await client.get(view.address)).status_code == 200
 
 
-async def test_a_page_that_nobody_looks_at_listens_to_nothing() -> None:
-    shown = Shown()
-    async with View(shown.bus, shown.buffer, 0):
-        before = len(shown.bus._subscribers.callbacks)
-        await anyio.wait_all_tasks_blocked()
-        assert (before, len(shown.bus._subscribers.callbacks)) == (0, 0)
-        assert [queue for queue in shown.bus.statistics().queues if queue.kind == "events"] == []
+# What a browser is told, and what it can do
 
 
-async def test_what_happens_is_drawn_while_somebody_looks(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+async def test_what_happens_is_drawn_while_somebody_looks_and_nothing_listens_after_that(
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    shown, viewers, sights = Shown(), 1, Queue[Sight]()
-    draw = Screen.show
+    shown = Shown(static("map", "dock"))
+    async with shown.page() as view:
 
-    def show(screen: Screen, sight: Sight) -> None:
-        draw(screen, sight)
-        sights.put(sight)
+        def steps(page: PageClient) -> None:
+            page.wait("2 of 2 frames", "none so far")
+            # Sent a second after its stamp.
+            shown.publish(moving("map", "tool", 99 * SECOND, 2.0))
+            page.wait("3 of 3 frames", "'tool' is new")
+            page.use("Frame", "tool", "2.000000 0.000000", '<td style="word-break: break-word">1 s</td>')
+            assert "'dock' is new" not in page.texts
+            # A picture that fails is told, and the next one is drawn.
+            torn = PointCloud("map", LATEST, np.zeros((1, 3)))
+            anyio.from_thread.run_sync(view.add_points, torn)
+            page.wait_until(lambda: page.nodes["/points/1"]["visible"])
+            object.__setattr__(torn, "frame", None)
+            page.use("Mode", "Pause")
+            while "could not be drawn" not in caplog.text:
+                page.wait_until(lambda: True)
+            anyio.from_thread.run_sync(view.remove_points)
+            anyio.from_thread.run_sync(shown.bus.remove_frame, "tool")
+            page.use("Mode", "Live", "2 of 2 frames", "'tool' was removed")
+            assert [queue.kind for queue in shown.bus.statistics().queues] == ["events"]
 
-    async def next_sight_with(frames: set[str]) -> Sight:
-        while True:
-            sight = await anyio.to_thread.run_sync(sights.get)
-            if set(sight.picture.scene.frames) == frames:
-                return sight
-
-    monkeypatch.setattr(Screen, "show", show)
-    monkeypatch.setattr(View, "viewers", property(lambda _: viewers))
-    shown.bus.publish(static("map", "dock"))
-    async with View(shown.bus, shown.buffer, 0, rate=1_000.0) as view:
-        await next_sight_with({"map", "dock"})
-        # Sent a second after its stamp.
-        shown.bus.publish(moving("map", "tool", 99 * SECOND, 2.0))
-        await next_sight_with({"map", "dock", "tool"})
-        assert view._page.delays == {"tool": 1.0}
-        assert [type(event) for event in view._page._events] == [FrameAdded]
-        # A picture that fails is told, and the next one is drawn.
-        monkeypatch.setattr(view._page, "picture", lambda _: 1 / 0)
-        view.add_points(PointCloud("map", LATEST, np.zeros((1, 3))))
-        assert list(view._screen._points) == ["points"]
-        while "could not be drawn" not in caplog.text:  # noqa: ASYNC110 - a log line sets no event
-            await anyio.sleep(0.001)
-        monkeypatch.delattr(view._page, "picture")
-        shown.bus.remove_frame("tool")
-        await next_sight_with({"map", "dock"})
-        assert view._page.delays == {}
-        viewers = 0
-        view.remove_points()
-        # Until nothing listens any more.
-        while shown.bus._subscribers.callbacks or shown.bus.statistics().queues:  # noqa: ASYNC110
+        await on_page(view, steps)
+        while view.viewers or shown.bus.statistics().queues:  # noqa: ASYNC110 - a browser that leaves sets no event
             await anyio.sleep(0.001)
 
 
 @pytest.mark.every_loop
-async def test_what_pages_send_cannot_end_the_program(caplog: pytest.LogCaptureFixture) -> None:
-    shown = Shown()
-    shown.bus.publish([static("map", "dock"), *over("map", "base", [99 * SECOND, 100 * SECOND])])
+async def test_no_turn_of_the_loop_does_the_work_of_a_page() -> None:
+    shown = Shown(*(moving(f"f{k // 2}", f"f{k + 1}", 99 * SECOND) for k in range(1_000)))
+    calls, most, ended = 0, 0, False
 
-    def use(address: str) -> None:
-        with connect(
-            address.replace("http", "ws"),
-            subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
-            proxy=None,
-            max_queue=None,
-        ) as client:
-            client.send(msgspec.msgpack.encode(CAMERA))
+    def count(_frame: FrameType, kind: str, _what: object) -> None:
+        nonlocal calls
+        calls += kind == "call"
+
+    async def watch() -> None:
+        nonlocal calls, most
+        while not ended:
+            most, calls = max(most, calls), 0
+            await checkpoint()
+
+    def steps(page: PageClient) -> None:
+        page.wait("1001 of 1001 frames")
+        for _ in range(20):
+            page.send(*(page.update("Mode", mode) for mode in ("Live", "Pause", "Play", "Live")))
+            page.send(page.update("Search", "9"), page.update("Labels", "all"), page.update("Frame", "f9"))
+            page.send(page.update("Step", "◀"), page.update("Trail on or off", True))
+        page.use("Mode", "Pause", "paused at")
+
+    async with shown.page() as view, anyio.create_task_group() as tasks:
+        # It counts in this thread, that of the loop.
+        sys.setprofile(count)
+        try:
+            tasks.start_soon(watch)
+            await on_page(view, steps)
+        finally:
+            sys.setprofile(None)
+            ended = True
+    # The events of a thousand new frames take 3,000 calls, and a copy of the tree or its text 18,000.
+    assert most < 5_000
+    assert view.statistics().conflated > 0
+    assert (view.statistics().pending, view.statistics().dropped) == (0, 0)
+
+
+async def test_a_click_or_a_search_selects_a_frame() -> None:
+    shown = Shown(moving("map", "base", 100 * SECOND, 1.0, "odometry"), static("base", "lidar", 2.0))
+    async with shown.page() as view:
+
+        def steps(page: PageClient) -> None:
+            page.wait_until(lambda: len(page.nodes["/axes"]["batched_positions"]) == 3)
+            page.send(*(CLICK | {"instance_index": place} for place in (99, 2)))
+            page.wait("3.000000 0.000000 0.000000 m", "lidar → base → map")
+            page.wait_until(lambda: page.controls["Frame"]["value"] == "lidar")
+            assert page.nodes["/chain"]["points"].reshape(-1, 2, 3)[:, :, 0].tolist() == [[3, 1], [1, 0]]
+            page.use("Frame", "(none)", "Click on a frame")
+            page.send(page.update("Search", "a"))
+            page.wait_until(lambda: page.controls["Frame"]["options"] == ["(none)", "base", "lidar", "map"])
+            page.use("Search", "BAS", "odometry")
+            page.wait_until(lambda: page.controls["Frame"]["options"] == ["(none)", "base"])
+            assert page.controls["Frame"]["value"] == "base"
+
+        await on_page(view, steps)
+
+
+async def test_axes_dots_and_lines_follow_the_frames() -> None:
+    shown = Shown(moving("map", "base", 99 * SECOND, 1.0), static("base", "lidar", 2.0))
+    async with shown.page() as view:
+
+        def steps(page: PageClient) -> None:
+            def at(*places: float) -> bool:
+                scene, lines = page.nodes, page.nodes["/edges"]["points"].reshape(-1, 2, 3)[:, :, 0].tolist()
+                x = [scene[name]["batched_positions"][:, 0].tolist() for name in ("/axes", "/origins")]
+                return x == [list(places)] * 2 and lines == [
+                    [places[1], 0.0],
+                    *([end, places[1]] for end in places[2:]),
+                ]
+
+            page.wait_until(lambda: at(0.0, 1.0, 3.0))
+            # A quarter of the mean of 1 m and 2 m.
+            assert page.controls["Axes [m]"]["value"] == pytest.approx(0.38)
+            assert page.camera["look_at"] == [1.5, 0.0, 0.0]
+            shown.publish(moving("map", "base", 100 * SECOND, 5.0))
+            page.wait_until(lambda: at(0.0, 5.0, 7.0))
+            shown.publish(static("base", "arm", 1.0))
+            page.wait_until(lambda: at(0.0, 5.0, 6.0, 7.0) or at(0.0, 5.0, 7.0, 6.0))
+            assert len(page.nodes["/axes"]["batched_wxyzs"]) == len(page.nodes["/origins"]["batched_colors"]) == 4
+            assert page.camera["look_at"] == [1.5, 0.0, 0.0]
+            page.send(page.update("Axes [m]", 0.5))
+            page.wait_until(lambda: page.nodes["/axes"]["axes_length"] == pytest.approx(0.5))
+            vertices = page.nodes["/origins"]["vertices"].astype(np.float64)
+            volume = np.linalg.det(vertices[page.nodes["/origins"]["faces"]]).sum() / 6.0
+            # A regular icosahedron whose faces look outward.
+            edge = 0.12 * 0.5 / math.sin(2.0 * math.pi / 5.0)
+            assert volume == pytest.approx(5.0 / 12.0 * (3.0 + math.sqrt(5.0)) * edge**3, rel=1e-5)
+            assert np.linalg.norm(vertices, axis=1) == pytest.approx(np.full(12, 0.06))
+
+        await on_page(view, steps)
+
+
+async def test_labels_follow_their_frames_and_hide_when_they_are_not_wanted() -> None:
+    shown = Shown(moving("map", "base", 99 * SECOND, 1.0))
+    async with shown.page() as view:
+
+        def steps(page: PageClient) -> None:
+            def labels() -> dict[str, float]:
+                found = [page.nodes[f"/labels/{k}"] for k in range(2) if f"/labels/{k}" in page.nodes]
+                return {each["text"]: each["position"][0] for each in found if each["visible"]}
+
+            page.send(page.update("Labels", "all"))
+            page.wait_until(lambda: labels() == {"map": 0.0, "base": 1.0})
+            shown.publish(moving("map", "base", 100 * SECOND, 4.0))
+            page.wait_until(lambda: labels() == {"map": 0.0, "base": 4.0})
+            page.send(page.update("Frame", "map"), page.update("Labels", "selection"))
+            page.wait_until(lambda: labels() == {"map": 0.0})
+            page.send(page.update("Labels", "none"))
+            page.wait_until(lambda: labels() == {})
+
+        await on_page(view, steps)
+
+
+async def test_the_controls_of_time_move_the_page() -> None:
+    shown = Shown(*over("map", "base", range(90 * SECOND, 101 * SECOND, SECOND), speed=1e-9))
+    async with shown.page(trails=["base"]) as view:
+
+        def steps(page: PageClient) -> None:
+            page.send(page.update("Speed", "× 0.1"))
+            page.wait_until(lambda: len(page.nodes["/trails"]["points"]) > 100)
+            page.wait("live")
+            assert page.controls["Time [s]"]["disabled"]
+            page.use("Mode", "Pause", "paused at 100.000 s, 10.000 s from the start")
+            slider = page.controls["Time [s]"]
+            page.wait_until(lambda: (slider["disabled"], slider["max"], slider["value"]) == (False, 10.0, 10.0))
+            shown.publish(moving("map", "base", 120 * SECOND, 7.0))
+            page.use("Step", "◀", "paused at 99.000 s")
+            page.use("Step", "▶", "paused at 100.000 s")
+            page.use("Time [s]", 2.5, "paused at 92.500 s")
+            page.wait_until(lambda: page.nodes["/axes"]["batched_positions"][1, 0] == 92.5)
+            page.use("Mode", "Play", "playing × 0.1 at")
+            page.use("Time [s]", 3.0, "paused at 93.000 s")
+            page.use("Mode", "Live", "live")
+            page.wait_until(lambda: page.nodes["/axes"]["batched_positions"][1, 0] == 7.0)
+
+        await on_page(view, steps)
+
+
+async def test_the_fixed_frame_is_chosen_and_frames_that_are_gone_stay_chosen() -> None:
+    none, largest = "(none)", "(root of the largest tree)"
+    shown = Shown(static("map", "base", 1.0), static("map", none), static("map", largest))
+    async with shown.page() as view:
+
+        def steps(page: PageClient) -> None:
+            page.use("Fixed frame", "base", "connected with 'base'")
+            page.use("Frame", "base", "0.000000 0.000000 0.000000 m")
+            # A frame with the name of a choice is offered once.
+            options = [page.controls[label]["options"] for label in ("Fixed frame", "Frame")]
+            assert [len(each) for each in options] == [len(set(each)) for each in options]
+            anyio.from_thread.run_sync(shown.bus.remove_frame, "base")
+            page.wait("'base' is not known: choose another one")
+            page.wait_until(lambda: "base" not in page.controls["Frame"]["options"][1:-1])
+            assert [page.controls[label]["value"] for label in ("Fixed frame", "Frame")] == ["base", "base"]
+            page.use("Fixed frame", largest, "connected with 'map'")
+
+        await on_page(view, steps)
+
+
+async def test_points_with_a_stamp_stay_where_their_frame_was_and_others_move_with_it() -> None:
+    shown = Shown(moving("map", "base", 99 * SECOND, 1.0), static("map", "site", 1.0))
+    cloud = np.array([[0.0, 1.0, 2.0], [np.nan, 0.0, 0.0], [3.0, 4.0, 5.0]])
+    colours = np.array([[1, 1, 1], [2, 2, 2], [300, 3, 3]])
+    async with shown.page() as view:
+        view.add_points(PointCloud("base", 99 * SECOND, cloud), "then", colour=colours)
+        view.add_points(PointCloud("base", LATEST, cloud), "now")
+        view.add_points(PointCloud("nobody", LATEST, cloud), "never")
+
+        def steps(page: PageClient) -> None:
+            def at(*places: float | None) -> bool:
+                found = [page.nodes[name] for name in sorted(page.nodes) if name.startswith("/points/")]
+                return [each["position"][0] if each["visible"] else None for each in found] == list(places)
+
+            page.wait_until(lambda: at(1.0, 1.0, None))
+            then = page.nodes["/points/1"]
+            assert (then["points"].tolist(), then["colors"].tolist()) == (
+                cloud[[0, 2]].tolist(),
+                [[1] * 3, [255, 3, 3]],
+            )
+            # The stamp leaves the history.
+            shown.publish(moving("map", "base", 119 * SECOND, 2.0))
+            page.wait_until(lambda: at(1.0, 2.0, None))
+            page.send(page.update("Fixed frame", "site"))
+            page.wait_until(lambda: at(None, 1.0, None))
+            anyio.from_thread.run_sync(view.remove_points, "now")
+            page.wait_until(lambda: at(None, None))
+
+        await on_page(view, steps)
+
+
+ROBOT = """<robot name="r"><link name="base"><visual><origin xyz="0 0 0.5"/><geometry><box size="1 2 3"/></geometry>
+<material name="red"><color rgba="1 0 0 1"/></material></visual></link><link name="tool"><visual><geometry>
+<sphere radius="0.5"/></geometry></visual><visual><origin xyz="1 0 0"/><geometry><box size="0.1 0.1 0.1"/></geometry>
+</visual></link></robot>"""
+
+
+async def test_the_shapes_of_a_robot_are_drawn_at_their_links_one_object_for_equal_triangles() -> None:
+    turned = Transform((0.0, 0.0, 0.0), (2 / 9, 4 / 9, 5 / 9, 6 / 9))
+    shown = Shown(static("map", "base", 2.0), TransformStamped("base", "tool", 0, turned, static=True))
+    async with shown.page(urdf=ROBOT) as view:
+
+        def steps(page: PageClient) -> None:
+            page.wait_until(lambda: {"/robot/0", "/robot/1"} <= page.nodes.keys())
+            boxes, spheres = page.nodes["/robot/0"], page.nodes["/robot/1"]
+            # The box of the tool is 1 m along x of the tool: the first column of the matrix of (2, 4, 5, 6) / 9.
+            x, y, z = 1 - 2 * (4 * 4 + 5 * 5) / 81, 2 * (2 * 4 + 5 * 6) / 81, 2 * (2 * 5 - 4 * 6) / 81
+            positions = np.array([[2.0, 0.0, 0.5], [2.0 + x, y, z]])
+            assert boxes["batched_positions"] == pytest.approx(positions, abs=1e-6)
+            assert boxes["batched_wxyzs"][1] == pytest.approx([6 / 9, 2 / 9, 4 / 9, 5 / 9])
+            assert boxes["batched_scales"] == pytest.approx(np.array([[1.0, 2.0, 3.0], [0.1, 0.1, 0.1]]))
+            assert boxes["batched_colors"].tolist()[0] == [255, 0, 0]
+            assert spheres["batched_positions"].tolist() == [[2.0, 0.0, 0.0]]
+            shown.publish(static("map", "base", 3.0))
+            page.wait_until(lambda: spheres["batched_positions"].tolist() == [[3.0, 0.0, 0.0]])
+            page.send(page.update("Robot", 0.25))
+            page.wait_until(lambda: boxes["opacity"] == spheres["opacity"] == 0.25)
+            anyio.from_thread.run_sync(shown.bus.remove_frame, "tool")
+            page.wait_until(
+                lambda: "/robot/1" not in page.nodes and len(page.nodes["/robot/0"]["batched_positions"]) == 1
+            )
+            page.send(page.update("Robot", 0.0))
+            page.wait_until(lambda: "/robot/0" not in page.nodes)
+
+        await on_page(view, steps)
+
+
+async def test_several_browsers_show_the_same_page() -> None:
+    async with Shown(static("map", "base", 1.0), static("base", "lidar", 1.0)).page() as view:
+
+        def steps(page: PageClient) -> None:
+            page.use("Search", "lid", "lidar → base → map")
+            with PageClient(view.address) as other:
+                other.wait("lidar → base → map", "2.000000 0.000000")
+                other.use("Frame", "(none)", "Click on a frame")
+                page.wait("Click on a frame")
+                assert view.viewers == 2
+
+        await on_page(view, steps)
+
+
+async def test_a_recording_offers_no_live_data() -> None:
+    async with Shown(static("map", "base")).page(live=False) as view:
+        await on_page(view, lambda page: page.wait_until(lambda: page.controls["Mode"]["options"] == ["Pause", "Play"]))
+
+
+# Strangers
+
+
+@pytest.mark.every_loop
+async def test_what_pages_send_cannot_end_the_program(caplog: pytest.LogCaptureFixture) -> None:
+    shown = Shown(static("map", "dock"), *over("map", "base", [99 * SECOND, 100 * SECOND]))
+    async with shown.page() as view:
+
+        def steps(page: PageClient) -> None:
             for label, *values in (
                 ("Speed", "no option", "× 1000", math.nan),
                 ("Mode", "no option", "Stop", True),
                 ("Time [s]", math.nan, math.inf, -1e300, "now"),
                 ("Fixed frame", "nowhere", 1),
-                ("Mode", "Pause"),
             ):
-                control = next(each for each in controls() if each.label == label)
-                for value in values:
-                    message = {"type": "GuiUpdateMessage", "uuid": control._impl.uuid, "updates": {"value": value}}
-                    client.send(msgspec.msgpack.encode(message))
-            assert client.ping().wait(30.0)
+                page.send(*(page.update(label, value) for value in values))
+            page.use("Mode", "Pause", "paused at", "connected with 'map'")
+            page.use("Mode", "Play", "playing × 1 ")
+            assert view.refused == 12
 
-    async with View(shown.bus, shown.buffer, 0) as view:
-        assert view._server is not None
-        handles = view._server.gui._gui_input_handle_from_uuid
-
-        def controls() -> list[Any]:
-            return list(handles.values())
-
-        await anyio.to_thread.run_sync(use, view.address)
-        with anyio.fail_after(30.0):
-            # The last one is sound.
-            while view._page.timeline.stamp is None:  # noqa: ASYNC110 - a control sets no event
-                await anyio.sleep(0.01)
-        assert (view._page.timeline.speed, view._page.chosen_fixed) == (1.0, None)
-        assert view.refused == 12
+        await on_page(view, steps)
     assert [record for record in caplog.records if record.levelname == "ERROR"] == []
 
 
@@ -321,37 +527,6 @@ async def test_a_moving_frame_moves_and_a_click_shows_where_it_is() -> None:
         await in_browser(steps)
 
 
-@look
-async def test_a_chosen_stamp_is_shown_and_stays_after_it_has_left_the_history() -> None:
-    shown = Shown(start=10 * SECOND)
-    shown.bus.publish(over("map", "base", range(0, 11 * SECOND, SECOND), speed=1e-9))
-    async with View(shown.bus, shown.buffer, 0) as view:
-
-        def pass_time() -> None:
-            shown.clock.set(100 * SECOND)
-            shown.bus.publish(moving("map", "base", 100 * SECOND, 100.0))
-
-        def steps(browser: Browser) -> None:
-            browser.open(view.address)
-            browser.enter("Search", "base")
-            browser.wait_for_fact("at", r"10\.000 s")
-            browser.press("Pause")
-            browser.wait_for("paused at 10.000 s")
-            anyio.from_thread.run_sync(pass_time)
-            browser.enter("Time [s]", "3.25")
-            facts = browser.wait_for_fact("at", r"3\.250 s")
-            assert numbers(facts["xyz"]) == pytest.approx([3.25, 0.0, 0.0], abs=1e-6)
-            browser.press("◀")
-            browser.wait_for_fact("at", r"3\.000 s")
-            browser.press("▶")
-            assert numbers(browser.wait_for_fact("at", r"4\.000 s")["xyz"])[0] == 4.0
-            browser.press("Live")
-            assert numbers(browser.wait_for_fact("at", r"100\.000 s")["xyz"])[0] == 100.0
-
-        await in_browser(steps)
-
-
-@look
 @on_one_loop
 async def test_stale_lost_and_new_frames_are_seen() -> None:
     shown = Shown()
@@ -380,7 +555,6 @@ async def test_stale_lost_and_new_frames_are_seen() -> None:
         await in_browser(steps)
 
 
-@look
 @on_one_loop
 async def test_a_recording_plays_to_its_end() -> None:
     tree = TransformTree(keep=None)
@@ -392,6 +566,8 @@ async def test_a_recording_plays_to_its_end() -> None:
                 browser.open(view.address)
                 browser.enter("Search", "bas")
                 assert numbers(browser.wait_for_fact("at", r"0\.000 s")["xyz"])[0] == 0.0
+                browser.enter("Time [s]", "1.5")
+                browser.wait_for_fact("at", r"1\.500 s")
                 browser.press("Play")
                 browser.wait_for("playing × 1 at")
                 browser.wait_for("paused at 2.900 s, 2.900 s from the start")
@@ -400,33 +576,6 @@ async def test_a_recording_plays_to_its_end() -> None:
             await in_browser(steps)
 
 
-@look
-@on_one_loop
-async def test_several_browsers_show_the_same_page_and_when_they_leave_nothing_listens() -> None:
-    shown = Shown()
-    shown.bus.publish([static("map", "base", 1.0), static("base", "lidar", 1.0)])
-    async with View(shown.bus, shown.buffer, 0) as view, anyio.create_task_group() as tasks:
-        selected, seen = anyio.Event(), anyio.Event()
-
-        def first(browser: Browser) -> None:
-            browser.open(view.address)
-            browser.enter("Search", "lid")
-            browser.wait_for_fact("frame", "lidar")
-            anyio.from_thread.run_sync(selected.set)
-            anyio.from_thread.run(seen.wait)
-
-        def second(browser: Browser) -> None:
-            anyio.from_thread.run(selected.wait)
-            browser.open(view.address)
-            assert browser.wait_for_fact("frame", "lidar")["xyz"].startswith("2.000000 0.000000")
-            assert view.viewers == 2
-            anyio.from_thread.run_sync(seen.set)
-
-        tasks.start_soon(in_browser, first)
-        await in_browser(second)
-
-
-@look
 @on_one_loop
 async def test_names_of_frames_are_texts_and_never_elements() -> None:
     evil = "<img src=x onerror=document.title='owned'>"

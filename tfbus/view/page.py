@@ -1,11 +1,10 @@
 """The model of the page: the choices that people make in the browser, and the picture that follows from them.
 
-It knows no browser and no event loop. `Page.picture` reads the tree at one instant; `Page.texts` gives what the side
-panel says.
+It knows no browser and no event loop. `Page.picture` reads the tree at the stamp of the `Timeline`: a `Scene`, and the
+trails. `Page.texts` gives the texts of the side panel. Another thread may feed the tree meanwhile.
 """
 
 import math
-from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Literal, NamedTuple
@@ -479,7 +478,7 @@ class Page:
         self.trails = dict.fromkeys(trails)
         self.search = ""
         self.delays: Mapping[str, float] = {}
-        self._events: deque[Event] = deque(maxlen=EVENTS_KEPT)
+        self._events: tuple[Event, ...] = ()
         self._live_tree = tree
         self._root: str | None = None
         self._counted: object = None
@@ -550,8 +549,9 @@ class Page:
             self.trails[self.selected] = None
 
     def note_event(self, event: Event) -> None:
-        """Keep an event to show; the oldest are forgotten."""
-        self._events.append(event)
+        """Keep an event to show, from one thread; the oldest are forgotten."""
+        # Another tuple, because another thread may be reading this one.
+        self._events = (event, *self._events[: EVENTS_KEPT - 1])
 
     def picture(self, now: int) -> Picture:
         """The picture at the chosen stamp, or of the newest data; ages are counted from the stamp `now`, in ns."""
@@ -590,7 +590,7 @@ class Page:
             self._status(frames, len(scene.frames)),
             _block(_table(facts) if facts else "Click on a frame, or search for one."),
             self._tree_text(frames, scene, then),
-            _block("<br>".join(escape(str(event)) for event in reversed(self._events)) or "none so far"),
+            _block("<br>".join(escape(str(event)) for event in self._events) or "none so far"),
             frames,
             matches[:_MATCHES],
             self.chosen_fixed,

@@ -1,7 +1,15 @@
-"""The side panel of the page, in viser: what people choose, and what they read."""
+"""The page in viser: a `Canvas` of frames, a robot's `Solids`, and a `Panel` of what people choose and read.
+
+All axes are one object, and so are all lines; an object in the browser for each frame would stall it at a thousand.
+World poses are computed here, and an object is sent again only if it has changed.
+
+All of this, and the `Page` that it shows, belongs to viser's thread: pictures, texts and copies of the tree take tens
+of ms with thousands of frames, for which the program's event loop must not wait. viser's queue of messages also fails
+now and then if another thread fills it while viser's empties it.
+"""
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import viser
@@ -13,6 +21,7 @@ from tfbus.rows import Row, compose
 from tfbus.stamps import SECOND, from_seconds
 from tfbus.view.meshes import Solid
 from tfbus.view.page import NO_SCENE, SPEEDS, Page, Picture, Scene, Texts
+from tfbus.view.server import Controls
 
 
 class Solids:
@@ -84,12 +93,6 @@ class Solids:
         )
 
 
-# The 3D part of the page, in viser.
-#
-# All axes are one object, and so are all lines; a frame of its own in the browser for each would stall it at a
-# thousand. World poses are computed here, and an object is sent again only if it has changed.
-
-
 HIGHLIGHT = (230, 159, 0)
 TRAIL = (204, 121, 167)
 _DOT = 0.12
@@ -105,13 +108,15 @@ class Canvas:
     Parameters
     ----------
     server : viser.ViserServer
-    clicked : callable
-        Called with the name of a frame that was clicked, in a thread of viser.
+    page : Page
+        A click on a frame selects it there.
+    controls : Controls
     """
 
-    def __init__(self, server: viser.ViserServer, clicked: Callable[[str], object]) -> None:
+    def __init__(self, server: viser.ViserServer, page: Page, controls: Controls) -> None:
         self._server = server
-        self._clicked = clicked
+        self._page = page
+        self._controls = controls
         self._drawn = Picture(NO_SCENE, (), NO_SCENE.lines)
         self._axes: viser.BatchedAxesHandle | None = None
         self._dots: viser.BatchedMeshHandle | None = None
@@ -212,10 +217,12 @@ class Canvas:
         self._axes.on_click(self._on_click)
         self._dots.on_click(self._on_click)
 
-    def _on_click(self, event: Any) -> None:
+    # viser calls an async function on its own loop, in the order of the events, and others in many threads.
+    async def _on_click(self, event: Any) -> None:
         frames, place = self._drawn.scene.frames, event.instance_index
         if place is not None and place < len(frames):
-            self._clicked(frames[place])
+            frame = frames[place]
+            self._controls.use("click", lambda: self._page.select(frame))
 
     def _draw_labels(self, scene: Scene, frames: Sequence[str]) -> None:
         places = {frame: place for place, frame in enumerate(scene.frames)} if frames else {}
@@ -255,12 +262,6 @@ _SLIDER_STEP = 0.001
 """s."""
 
 
-class Post(Protocol):
-    """A function that has another one called on the event loop, and the page drawn anew."""
-
-    def __call__(self, control: Callable[[], object], /) -> None: ...
-
-
 class Panel:
     """The controls and texts of a page.
 
@@ -268,14 +269,13 @@ class Panel:
     ----------
     server : viser.ViserServer
     page : Page
-        Changed by the controls, through `post`.
-    post : callable
-        May be called in any thread.
+        Changed by what people choose.
+    controls : Controls
     """
 
-    def __init__(self, server: viser.ViserServer, page: Page, post: Post) -> None:
+    def __init__(self, server: viser.ViserServer, page: Page, controls: Controls) -> None:
         self._page = page
-        self._post = post
+        self._controls = controls
         gui = server.gui
         self._status = gui.add_html("")
         self._fixed = gui.add_dropdown("Fixed frame", (LARGEST,), hint="The frame that stands still")
@@ -337,20 +337,19 @@ class Panel:
             set_value(self._slider, (stamp - start) / SECOND)
 
     def _chosen(self, control: Any, choose: Callable[[Any], object]) -> None:
-        """Call a function on the event loop with each value that somebody chooses in a browser."""
+        """Call a function with the value that somebody chooses in a browser."""
         control.on_update(self._callback(choose))
 
     def _pressed(self, control: Any, choose: Callable[[Any], object]) -> None:
-        """Call a function on the event loop with the name of each button that somebody presses."""
+        """Call a function with the name of the button that somebody presses."""
         control.on_click(self._callback(choose))
 
     def _callback(self, choose: Callable[[Any], object]) -> Callable[[Any], Awaitable[None]]:
-        # viser calls an async function on its own loop, in the order of the events, and others in many threads.
         async def used(event: Any) -> None:
             # What the program itself sets has no client.
             if event.client_id is not None:
                 value = event.target.value
-                self._post(lambda: choose(value))
+                self._controls.use(id(event.target), lambda: choose(value))
 
         return used
 
@@ -405,18 +404,6 @@ class Points(NamedTuple):
     colour: Any
 
 
-class Sight(NamedTuple):
-    """The content of a page at a moment."""
-
-    picture: Picture
-    texts: Texts | None
-    """None if they stay as they are."""
-    points: Mapping[str, tuple[Points, Row | None]]
-    """With their pose in the fixed frame; None for those that have none."""
-    chosen: tuple[int, int, int] | None
-    """The chosen stamp, and the start and end of the span in which it is, in ns; None while the page is live."""
-
-
 class Screen:
     """Shows a page in the browsers of a server.
 
@@ -426,72 +413,56 @@ class Screen:
     page : Page
     solids : sequence of Solid
         The visible shapes of a robot.
-    post : callable
-        Has a function called on the event loop, and the page drawn anew; viser's threads call it.
-
-    Notes
-    -----
-    `read` belongs to the event loop of the bus, `show` to that of viser: viser's queue of messages fails now and then
-    if another thread fills it while viser's empties it.
+    controls : Controls
     """
 
-    def __init__(self, server: viser.ViserServer, page: Page, solids: Sequence[Solid], post: Post) -> None:
+    def __init__(self, server: viser.ViserServer, page: Page, solids: Sequence[Solid], controls: Controls) -> None:
         self._server = server
         self._page = page
-        self._canvas = Canvas(server, lambda frame: post(lambda: page.select(frame)))
-        self._panel = Panel(server, page, post)
+        self._controls = controls
+        self._canvas = Canvas(server, page, controls)
+        self._panel = Panel(server, page, controls)
         self._solids = Solids(server, solids) if solids else None
         if self._solids is not None:
             self._canvas.show_solids(self._solids)
             self._panel.robot.visible = True
-        self._points: Mapping[str, Points] = {}
         self._drawn_points: dict[str, Points] = {}
         # By the identity of the points.
         self._poses_of_points: dict[int, tuple[str, Row]] = {}
         self._fitted = False
         self._texts_due = 0
 
-    def set_points(self, points: Mapping[str, Points]) -> None:
-        """Show these points, by name, from the next `read` on."""
-        self._points = points
-
-    def read(self, now: int, elapsed: int, texts: bool) -> Sight:
-        """The content of the page now, for `show`.
+    def draw(self, now: int, elapsed: int, points: Mapping[str, Points], texts: bool = False) -> None:
+        """Change the page as people have chosen, and bring the browsers to it.
 
         Parameters
         ----------
         now : int
             The stamp (ns) that ages are counted from.
         elapsed : int
-            A monotonic time, in ns; the texts are not made more often than people can read them.
+            A monotonic time, in ns; without a choice, texts are made as often as people can read them.
+        points : mapping of str to Points
+            By name.
         texts : bool
             Whether to make the texts in any case.
         """
         page, line = self._page, self._page.timeline
+        texts |= self._controls.apply()
         picture = page.picture(now)
         made = None
         if texts or elapsed >= self._texts_due:
             self._texts_due = elapsed + _TEXTS_EVERY
             made = page.texts(now, picture.scene)
-        fixed = picture.scene.frames[0] if picture.scene.frames else None
-        points = {name: (each, self._pose_of_points(each, fixed)) for name, each in self._points.items()}
-        self._poses_of_points = {each: pose for each, pose in self._poses_of_points.items() if each in self._known()}
-        chosen = None if line.stamp is None else (line.stamp, line.start, line.end)
-        return Sight(picture, made, points, chosen)
-
-    def show(self, sight: Sight) -> None:
-        """Bring the browsers to what was read."""
-        picture = sight.picture
         if not self._fitted and picture.scene.lines.size:
             self._fit(picture.scene)
         if self._solids is not None:
             self._solids.opacity = self._panel.robot.value
         with self._server.atomic():
             self._canvas.draw(picture, self._panel.axes_length.value)
-            self._show_points(sight.points)
-            self._panel.show_time(sight.chosen)
-            if sight.texts is not None:
-                self._panel.show(sight.texts)
+            self._show_points(points, picture.scene.frames[0] if picture.scene.frames else None)
+            self._panel.show_time(None if line.stamp is None else (line.stamp, line.start, line.end))
+            if made is not None:
+                self._panel.show(made)
         self._server.flush()
 
     def _fit(self, scene: Scene) -> None:
@@ -509,18 +480,17 @@ class Screen:
             client.camera.position = position
             client.camera.look_at = middle
 
-    def _show_points(self, points: Mapping[str, tuple[Points, Row | None]]) -> None:
+    def _show_points(self, points: Mapping[str, Points], fixed: str | None) -> None:
         for name in [name for name in self._drawn_points if name not in points]:
             self._canvas.remove_points(name)
             del self._drawn_points[name]
-        for name, (each, pose) in points.items():
+        for name, each in points.items():
             if self._drawn_points.get(name) is not each:
                 self._canvas.add_points(name, each.cloud, each.size, each.colour)
                 self._drawn_points[name] = each
-            self._canvas.place_points(name, pose)
-
-    def _known(self) -> set[int]:
-        return {id(each) for each in self._points.values()}
+            self._canvas.place_points(name, self._pose_of_points(each, fixed))
+        known = {id(each) for each in points.values()}
+        self._poses_of_points = {each: pose for each, pose in self._poses_of_points.items() if each in known}
 
     def _pose_of_points(self, points: Points, fixed: str | None) -> Row | None:
         """The pose of points at their own stamp; that of an instant that has left the history stays as it was."""

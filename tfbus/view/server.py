@@ -1,12 +1,17 @@
-"""The queue of what people do in the browser; the callbacks come in other threads."""
+"""The web server of the page: viser's, without a word on standard output, and with a door in front of it.
+
+viser answers any page, sets whatever attribute of a control a message names, and serves as many connections as come.
+Here the head of each request goes through a `WebDoor` before viser sees it, each message through `_Messages`, which
+lets pass what the page itself sends, and `Controls` keeps what people do until the page is drawn.
+"""
 
 import asyncio
+import logging
 import math
 import socket
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Annotated, Any
 
@@ -19,18 +24,13 @@ from tfbus._aio.loops import LoopWaker
 from tfbus._aio.web_door import HEAD_END, HEAD_TIME, MAX_HEAD, WebDoor
 from tfbus.statistics import QueueStatistics
 
-# The web server of the page: viser's, for this machine only and without a word on standard output.
-#
-# viser answers any page, and sets whatever attribute of a control a message names. Here its server is given a door: the
-# head of each request goes through a `WebDoor` before viser sees it, and each message through `_Messages`, which lets
-# pass what the page itself sends.
-
-
 _PORTS_TRIED = 100
 MAX_MESSAGE = 65_536
 """Bytes of a message of a browser."""
 MAX_TEXT = 1_000
 """Letters that somebody can type."""
+MAX_CONNECTIONS = 100
+"""Connections at once; a browser has one for the page, and some while it loads it."""
 _MOST = 1e12
 _NEAR = 1e-6
 _console_lock = threading.Lock()
@@ -117,21 +117,30 @@ class _Messages:
 class _AtTheDoor(asyncio.Protocol):
     """A connection whose head is judged before the protocol that serves it is made."""
 
-    def __init__(self, door: WebDoor, make: Callable[[], Any]) -> None:
-        self._door = door
+    def __init__(self, guarded: "_Guarded", make: Callable[[], Any]) -> None:
+        self._guarded = guarded
         self._make = make
         self._head = bytearray()
         self._transport: Any = None
         self._timer: asyncio.TimerHandle
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Wait for the head."""
+        """Wait for the head, if there is room for one more connection."""
         self._transport = transport
-        self._timer = asyncio.get_running_loop().call_later(HEAD_TIME, self._transport.abort)
+        self._timer = asyncio.get_running_loop().call_later(HEAD_TIME, self.end)
+        self._guarded.connections.add(self)
+        if len(self._guarded.connections) > MAX_CONNECTIONS:
+            self._guarded.refuse_connection()
+            self.end()
 
     def connection_lost(self, error: Exception | None) -> None:  # noqa: ARG002 - asyncio's signature
-        """Forget it."""
+        """Make room for another one."""
         self._timer.cancel()
+        self._guarded.connections.discard(self)
+
+    def end(self) -> None:
+        """End the connection at once."""
+        self._transport.abort()
 
     def data_received(self, data: bytes) -> None:
         """Judge the head as soon as it is there."""
@@ -141,7 +150,7 @@ class _AtTheDoor(asyncio.Protocol):
         if end < 0 and len(self._head) <= MAX_HEAD:
             return
         self._timer.cancel()
-        answer = self._door.answer(bytes(self._head))
+        answer = self._guarded.door.answer(bytes(self._head))
         if answer is not None:
             self._transport.write(answer)
             self._transport.close()
@@ -150,6 +159,13 @@ class _AtTheDoor(asyncio.Protocol):
         served.protocol.max_message_size = MAX_MESSAGE
         # Texts come as bytes too; viser takes them for an error of its own.
         served.recv = partial(served.recv, decode=False)
+        lost = served.connection_lost
+
+        def connection_lost(error: Exception | None) -> None:
+            self.connection_lost(error)
+            lost(error)
+
+        served.connection_lost = connection_lost
         self._transport.set_protocol(served)
         served.connection_made(self._transport)
         served.data_received(bytes(self._head))
@@ -160,6 +176,21 @@ class _Guarded(viser.infra.WebsockServer):
 
     door: WebDoor
     guarded = False
+    connections: set[_AtTheDoor]
+    refused_connections = 0
+
+    def end_connections(self) -> None:
+        """End the connections, which viser ends only as far as it serves them; in viser's thread."""
+        for connection in self.connections:
+            connection.end()
+
+    def refuse_connection(self) -> None:
+        """Count a connection for which there is no room; the first is told."""
+        self.refused_connections += 1
+        if self.refused_connections == 1:
+            logging.getLogger("tfbus").warning(
+                "a connection to the page was refused, because it has %d; later ones are only counted", MAX_CONNECTIONS
+            )
 
     @property
     def _background_event_loop(self) -> Any:
@@ -172,7 +203,7 @@ class _Guarded(viser.infra.WebsockServer):
 
         def create_server(make: Callable[[], Any], *args: Any, **options: Any) -> Any:
             self.guarded = True
-            return listen(lambda: _AtTheDoor(self.door, make), *args, **options)
+            return listen(lambda: _AtTheDoor(self, make), *args, **options)
 
         loop.create_server = create_server
 
@@ -204,8 +235,21 @@ class Server(viser.ViserServer):
     def _websock_server(self, server: Any) -> None:
         server.__class__ = _Guarded
         server.door = self.door
+        server.connections = set()
         server._message_class = _Messages(self, server._message_class)
         self.__dict__["_websockets"] = server
+
+    @property
+    def refused_connections(self) -> int:
+        """Connections for which there was no room."""
+        found: int = self._websock_server.refused_connections
+        return found
+
+    def stop(self) -> None:
+        """Stop serving; it waits for viser's thread."""
+        with suppress(RuntimeError):
+            self.get_event_loop().call_soon_threadsafe(self._websock_server.end_connections)
+        super().stop()
 
     def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002 - viser's signature
         """Refuse: viser would pass the page on through a server on the internet."""
@@ -289,65 +333,53 @@ def _silent() -> Iterator[None]:
             console.quiet = before
 
 
-CAPACITY = 1_000
+CAPACITY = 12
+"""Controls of the page, with a click on a frame."""
 
 
 class Controls:
-    """Calls functions on the event loop that other threads hand over, in their order, one in each turn of the loop.
+    """What people did on the page since it was drawn last; of each control, the newest value counts.
 
-    When more than `CAPACITY` are pending, the oldest is dropped and counted.
+    It belongs to viser's thread: viser calls `use` there, and the page is changed there when it is drawn. So a flood
+    of messages costs the program's event loop one wake-up a picture, whatever they change.
 
     Parameters
     ----------
     called : callable
-        Called on the loop after a function was called.
+        Called on the event loop soon after a control was used.
     """
 
     def __init__(self, called: Callable[[], object]) -> None:
-        self.dropped = 0
-        self._called = called
-        self._pending: deque[Callable[[], object]] = deque()
-        self._lock = threading.Lock()
-        self._waker = LoopWaker(self._drain)
-        self._ended = False
+        self._waker = LoopWaker(called)
+        self._waiting: dict[object, Callable[[], object]] = {}
+        self._conflated = 0
 
     def bind(self) -> None:
-        """Use the running event loop."""
+        """Wake the running event loop from now on."""
         self._waker.bind()
 
-    def put(self, control: Callable[[], object]) -> None:
-        """Hand a function over, from any thread; after `end`, or without the loop, nothing happens."""
-        with self._lock:
-            if self._ended:
-                return
-            if len(self._pending) == CAPACITY:
-                self._pending.popleft()
-                self.dropped += 1
-            self._pending.append(control)
-        try:
-            self._waker.wake()
-        except RuntimeError:
-            # The event loop has ended before the server.
-            self.end()
+    def use(self, control: object, change: Callable[[], object]) -> None:
+        """Have a change made when the page is drawn next, instead of an earlier one by the same control."""
+        self._conflated += self._waiting.pop(control, None) is not None
+        self._waiting[control] = change
+        self.wake()
 
-    def end(self) -> None:
-        """Drop what is pending, and take no more."""
-        with self._lock:
-            self._ended = True
-            self._pending.clear()
+    def wake(self) -> None:
+        """Have the page drawn; for any thread."""
+        # The event loop may have ended before the server.
+        with suppress(RuntimeError):
+            self._waker.wake()
+
+    def apply(self) -> bool:
+        """Make the changes in the order in which they came; whether there were any."""
+        waiting, self._waiting = self._waiting, {}
+        for change in waiting.values():
+            try:
+                change()
+            except Exception:
+                logging.getLogger("tfbus").exception("a control of the page failed")
+        return bool(waiting)
 
     def statistics(self) -> QueueStatistics:
-        """The queue's counters."""
-        return QueueStatistics("controls", "drop_oldest", CAPACITY, len(self._pending), self.dropped)
-
-    def _drain(self) -> None:
-        with self._lock:
-            if not self._pending:
-                return
-            control = self._pending.popleft()
-            more = bool(self._pending)
-        if more:
-            # A flood of clicks must not hold the program up.
-            self._waker.wake()
-        control()
-        self._called()
+        """The counters of the changes that wait for the next picture."""
+        return QueueStatistics("controls", "conflate", CAPACITY, len(self._waiting), 0, self._conflated)

@@ -1,9 +1,13 @@
-"""`View`, the live 3D page of a bus."""
+"""`View`, the live 3D page of a bus.
+
+The program's event loop decides when to draw, and waits; viser's thread changes the page as people have chosen, reads
+the tree and draws. What browsers send costs the loop one wake-up a picture, and pictures take at most half of the time.
+"""
 
 import logging
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -33,7 +37,7 @@ from tfbus.statistics import QueueStatistics
 from tfbus.tree.history import STALE_AFTER
 from tfbus.view.meshes import MeshFiles, Solid, solids_of
 from tfbus.view.page import Page
-from tfbus.view.screen import Points, Screen, Sight
+from tfbus.view.screen import Points, Screen
 from tfbus.view.server import Controls, Server, start_server, stop_server
 
 _FEW = 100
@@ -137,10 +141,11 @@ class View:
         self._stale_after = self._page_options[3]
         self._points: dict[str, Points] = {}
         self._log = OnceLogger(logging.getLogger("tfbus"))
-        self._controls = Controls(self._control_used)
+        self._controls = Controls(lambda: self._changed.set())
         self._changed = anyio.Event()
         self._drawn = anyio.Event()
         self._drawn_waker = LoopWaker(lambda: self._drawn.set())
+        self._drawn_at = time.monotonic_ns()
         self._texts_wanted = True
         self._entered = False
         self._page: Page
@@ -181,7 +186,8 @@ class View:
             raise TypeError(f"a size must be a number of m, not {size!r}")
         if not 0.0 < size < float("inf"):
             raise ValueError(f"a size must be greater than zero and finite, got {size!r}")
-        self._points[name] = Points(cloud, float(size), _as_colours(colour, len(cloud)))
+        # Another dict, because viser's thread may be reading this one.
+        self._points = {**self._points, name: Points(cloud, float(size), _as_colours(colour, len(cloud)))}
         self._changed.set()
 
     def remove_points(self, name: str = "points") -> None:
@@ -192,7 +198,9 @@ class View:
         KeyError
             If there are none of this name.
         """
-        del self._points[name]
+        points = dict(self._points)
+        del points[name]
+        self._points = points
         self._changed.set()
 
     @property
@@ -202,11 +210,12 @@ class View:
 
     @property
     def refused(self) -> int:
-        """Requests of other pages, and messages of this one that it does not send, that were refused."""
-        return self._door.refused + (self._server.refused if self._server is not None else 0)
+        """Requests of other pages, messages that this one does not send, and connections beyond 100 at once."""
+        server = self._server
+        return self._door.refused + (server.refused + server.refused_connections if server is not None else 0)
 
     def statistics(self) -> QueueStatistics:
-        """The counters of the queue of what people do on the page."""
+        """The counters of what people do on the page; of each control, a picture shows the newest value."""
         return self._controls.statistics()
 
     async def __aenter__(self) -> Self:
@@ -226,8 +235,7 @@ class View:
             solids = await anyio.to_thread.run_sync(self._read_solids)
             server = self._server = await anyio.to_thread.run_sync(start_server, self._host, self._port, self._door)
         try:
-            self._screen = Screen(server, self._page, solids, self._controls.put)
-            self._screen.set_points(self._points)
+            self._screen = Screen(server, self._page, solids, self._controls)
             server.on_client_connect(self._client_changed)
             server.on_client_disconnect(self._client_changed)
             self.address = f"http://{f'[{self._host}]' if ':' in self._host else self._host}:{server.get_port()}"
@@ -250,7 +258,6 @@ class View:
     async def _stop(self) -> None:
         self.address = ""
         self.bus._entered.discard(self)
-        self._controls.end()
         server, self._server = self._server, None
         if server is not None:
             with anyio.CancelScope(shield=True):
@@ -276,37 +283,39 @@ class View:
         async with anyio.create_task_group() as tasks:
             with self._listening():
                 tasks.start_soon(self._note_events)
-                before = time.monotonic_ns()
+                self._drawn_at = time.monotonic_ns()
                 while self.viewers:
                     self._changed = anyio.Event()
-                    elapsed = time.monotonic_ns()
-                    self._page.timeline.advance((elapsed - before) / 1e9)
-                    before = elapsed
-                    await self._draw(elapsed)
-                    await anyio.sleep(self._period)
+                    before = time.monotonic()
+                    await self._draw()
+                    # The program has work of its own.
+                    await anyio.sleep(max(self._period, time.monotonic() - before))
                     if not self._page.timeline.playing:
                         with anyio.move_on_after(_AT_LEAST_EVERY):
                             await self._changed.wait()
             tasks.cancel_scope.cancel()
 
-    async def _draw(self, elapsed: int) -> None:
-        """Read the page here, have viser's thread show it, and wait until it has."""
-        texts, self._texts_wanted = self._texts_wanted, False
+    async def _draw(self) -> None:
+        """Have viser's thread draw the page, and wait until it has."""
+        assert self._server is not None
         drawn = self._drawn = anyio.Event()
+        texts, self._texts_wanted = self._texts_wanted, False
+        now, points = self.bus.clock.now(), self._points
         try:
-            assert self._server is not None
-            sight = self._screen.read(self.bus.clock.now(), elapsed, texts)
-            self._server.get_event_loop().call_soon_threadsafe(self._show_sight, sight)
-        except Exception as error:  # noqa: BLE001 - a picture that fails must not end the program that it is of
+            self._server.get_event_loop().call_soon_threadsafe(self._draw_now, now, points, texts)
+        except RuntimeError as error:
             self._warn(error)
         else:
             await drawn.wait()
 
-    def _show_sight(self, sight: Sight) -> None:
-        """Show what was read; called in viser's thread."""
+    def _draw_now(self, now: int, points: Mapping[str, Points], texts: bool) -> None:
+        """Draw the page; called in viser's thread."""
         try:
-            self._screen.show(sight)
-        except Exception as error:  # noqa: BLE001 - as above
+            elapsed = time.monotonic_ns()
+            self._page.timeline.advance((elapsed - self._drawn_at) / 1e9)
+            self._drawn_at = elapsed
+            self._screen.draw(now, elapsed, points, texts)
+        except Exception as error:  # noqa: BLE001 - a picture that fails must not end the program that it is of
             self._warn(error)
         # The event loop may have ended before the server.
         with suppress(RuntimeError):
@@ -359,11 +368,8 @@ class View:
                 self._changed.set()
 
     def _client_changed(self, _: object) -> None:
-        self._controls.put(lambda: None)
-
-    def _control_used(self) -> None:
         self._texts_wanted = True
-        self._changed.set()
+        self._controls.wake()
 
 
 def _as_colours(colour: Any, count: int) -> Any:

@@ -2,9 +2,7 @@ import math
 import random
 import socket
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from typing import Any, Self
 
 import httpx
 import pytest
@@ -12,44 +10,15 @@ import pytest
 pytest.importorskip("viser", reason="the live page needs viser")
 
 import msgspec
-import viser
-from support.viser_pages import CAMERA, viser_page
-from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
-from websockets.typing import Origin, Subprotocol
+from support.viser_pages import CAMERA, CLICK, PageClient, viser_page
+from websockets.exceptions import InvalidMessage, InvalidStatus
 
 from tfbus._aio.web_door import WebDoor
-from tfbus.view.server import MAX_MESSAGE, MAX_TEXT, Server, start_server, stop_server
-
-CLICK = {
-    "type": "SceneNodeClickMessage",
-    "name": "/axes",
-    "instance_index": 0,
-    "ray_origin": (0, 0, 0),
-    "ray_direction": (0, 0, 1),
-    "screen_pos": (0.5, 0.5),
-    "modifier": None,
-    "owner": "",
-}
+from tfbus.view.server import MAX_CONNECTIONS, MAX_MESSAGE, MAX_TEXT, Server, start_server, stop_server
 
 
-@contextmanager
-def browser(server: Server, origin: str | None = None) -> Iterator[ClientConnection]:
-    """A connection as that of the page; what the server sends is dropped."""
-    client: ClientConnection = connect(
-        f"ws://127.0.0.1:{server.get_port()}",
-        origin=None if origin is None else Origin(origin),
-        subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
-        proxy=None,
-        max_size=None,
-        max_queue=None,
-    )
-    with client:
-        yield client
-
-
-def update(control: Any, value: Any) -> dict[str, Any]:
-    return {"type": "GuiUpdateMessage", "uuid": control._impl.uuid, "updates": {"value": value}}
+def browser(server: Server, origin: str | None = None) -> PageClient:
+    return PageClient(f"http://127.0.0.1:{server.get_port()}", origin)
 
 
 def test_the_page_comes_from_the_loopback_and_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
@@ -58,15 +27,6 @@ def test_the_page_comes_from_the_loopback_and_nothing_is_printed(capfd: pytest.C
         assert httpx.get(f"http://127.0.0.1:{server.get_port()}", trust_env=False).status_code == 200
         assert server.request_share_url() is None
     assert capfd.readouterr() == ("", "")
-
-
-def test_taken_ports_are_passed_over() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        server = start_server("127.0.0.1", taken.getsockname()[1])
-        try:
-            assert server.get_port() > taken.getsockname()[1]
-        finally:
-            stop_server(server)
 
 
 def test_the_port_after_the_last_one_is_not_tried() -> None:
@@ -89,7 +49,7 @@ def test_pages_of_other_sites_and_other_names_get_nothing() -> None:
                 pytest.fail("connected")
         for own in (None, f"http://127.0.0.1:{port}", f"http://localhost:{port}"):
             with browser(server, own) as client:
-                assert client.recv(timeout=30.0)
+                assert client.socket.recv(timeout=30.0)
         for host, status in (("evil.example", 403), (f"evil.example:{port}", 403), (f"localhost:{port}", 200)):
             answer = httpx.get(f"http://127.0.0.1:{port}", headers={"Host": host}, trust_env=False)
             assert answer.status_code == status
@@ -100,7 +60,7 @@ def test_another_site_that_the_user_names_may_use_the_page() -> None:
     server = start_server("127.0.0.1", 0, WebDoor("127.0.0.1", ["https://robot.example"]))
     try:
         with browser(server, "https://robot.example") as client:
-            assert client.recv(timeout=30.0)
+            assert client.socket.recv(timeout=30.0)
         with pytest.raises(InvalidStatus, match="403"), browser(server, "https://evil.example"):
             pytest.fail("connected")
     finally:
@@ -121,8 +81,35 @@ def test_a_head_that_comes_in_pieces_is_judged_and_one_without_an_end_is_refused
             assert client.recv(1_000).split()[1] == b"400"
 
 
+def test_connections_have_a_bound_and_those_that_say_nothing_count(caplog: pytest.LogCaptureFixture) -> None:
+    with viser_page() as server:
+        address = ("127.0.0.1", server.get_port())
+        page = browser(server)
+        page.wait_until(lambda: page.nodes)
+        idle = [socket.create_connection(address) for _ in range(MAX_CONNECTIONS - 1)]
+        for _ in range(3):
+            with socket.create_connection(address) as client:
+                assert client.recv(1) == b""
+        assert server.refused_connections == 3
+        assert caplog.text.count("a connection to the page was refused") == 1
+        page.send(CAMERA)
+        page.socket.close()
+        for each in idle:
+            each.close()
+        while True:
+            try:
+                with browser(server) as other:
+                    other.wait_until(lambda: other.nodes)
+                    break
+            except (OSError, EOFError, InvalidMessage):
+                # The server has not read yet that others have left.
+                continue
+
+
 class Controlled:
-    """A page with one control of each kind, and what was used of them."""
+    """A page with one control of each kind, and a browser of it."""
+
+    labels = ("Speed", "Time [s]", "Search", "Mode", "Trail")
 
     def __init__(self, server: Server) -> None:
         gui = server.gui
@@ -130,59 +117,60 @@ class Controlled:
         self.slider = gui.add_slider("Time [s]", 0.0, 10.0, 0.001, 5.0)
         self.text = gui.add_text("Search", "")
         self.buttons = gui.add_button_group("Mode", ("Pause", "Play"))
-        self.button = gui.add_button("Trail")
-        self.all = (self.dropdown, self.slider, self.text, self.buttons, self.button)
-        self._last = gui.add_button("last")
+        gui.add_button("Trail")
         self._read = threading.Event()
-        self._last.on_click(lambda _: self._read.set())
+        gui.add_button("last").on_click(lambda _: self._read.set())
+        self.browser = browser(server)
+        self.browser.wait_until(lambda: self.browser.controls["last"])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.browser.socket.close()
 
     def values(self) -> tuple[object, ...]:
-        return tuple(control.value for control in self.all[:-1])
+        return tuple(control.value for control in (self.dropdown, self.slider, self.text, self.buttons))
 
-    def send(self, client: ClientConnection, *messages: Any) -> None:
+    def send(self, *messages: Any) -> None:
         """Send messages, and wait until viser has read them."""
         self._read.clear()
-        for message in (*messages, CAMERA, update(self._last, True)):
-            client.send(message if isinstance(message, bytes | str) else msgspec.msgpack.encode(message))
+        self.browser.send(*messages, CAMERA, self.browser.update("last", True))
         assert self._read.wait(30.0)
+
+    def use(self, *values: tuple[str, Any]) -> None:
+        self.send(*(self.browser.update(label, value) for label, value in values))
 
 
 def test_what_a_page_sends_sets_its_controls() -> None:
-    with viser_page() as server:
-        page = Controlled(server)
-        with browser(server) as client:
-            page.send(
-                client, CAMERA, CLICK, update(page.dropdown, "fast"), update(page.slider, 3), update(page.text, "base")
-            )
-            page.send(client, update(page.buttons, "Play"), update(page.button, True))
-            assert page.values() == ("fast", 3.0, "base", "Play")
-            # A browser may round to a step beyond the end.
-            page.send(client, update(page.slider, 10.001))
-            assert page.slider.value == 10.0
+    with viser_page() as server, Controlled(server) as page:
+        page.send(CAMERA, CLICK)
+        page.use(("Speed", "fast"), ("Time [s]", 3), ("Search", "base"), ("Mode", "Play"), ("Trail", True))
+        assert page.values() == ("fast", 3.0, "base", "Play")
+        # A browser may round to a step beyond the end.
+        page.use(("Time [s]", 10.001))
+        assert page.slider.value == 10.0
         assert server.refused == 0
 
 
 def test_a_value_that_a_control_cannot_have_is_refused_and_counted() -> None:
-    with viser_page() as server:
-        page = Controlled(server)
+    with viser_page() as server, Controlled(server) as page:
         before = page.values()
-        bad: list[tuple[Any, list[Any]]] = [
-            (page.dropdown, ["", "Fast", 1, None, True, ["fast"], math.nan]),
-            (page.slider, [math.nan, math.inf, -math.inf, 1e300, "3", True, None, [3]]),
-            (page.text, ["x" * (MAX_TEXT + 1), 1, None, {"a": 1}, b"bytes"]),
-            (page.buttons, ["Live", 1, None]),
-            (page.button, ["x", 1.5, None]),
+        bad: list[tuple[str, list[Any]]] = [
+            ("Speed", ["", "Fast", 1, None, True, ["fast"], math.nan]),
+            ("Time [s]", [math.nan, math.inf, -math.inf, 1e300, "3", True, None, [3]]),
+            ("Search", ["x" * (MAX_TEXT + 1), 1, None, {"a": 1}, b"bytes"]),
+            ("Mode", ["Live", 1, None]),
+            ("Trail", ["x", 1.5, None]),
         ]
-        messages = [update(control, value) for control, values in bad for value in values]
-        with browser(server) as client:
-            page.send(client, *messages)
-            assert (page.values(), server.refused) == (before, len(messages))
+        sent = [(label, value) for label, values in bad for value in values]
+        page.use(*sent)
+        assert (page.values(), server.refused) == (before, len(sent))
 
 
 def test_no_message_reaches_more_than_the_value_of_a_control() -> None:
-    with viser_page() as server:
-        page = Controlled(server)
-        uuid = page.dropdown._impl.uuid
+    with viser_page() as server, Controlled(server) as page:
+        uuid = page.browser.controls["Speed"]["uuid"]
         messages: list[Any] = [
             {"type": "GuiUpdateMessage", "uuid": uuid, "updates": updates}
             for updates in (
@@ -207,47 +195,27 @@ def test_no_message_reaches_more_than_the_value_of_a_control() -> None:
             CLICK | {"more": 1},
             *(b"", b"\xc1", "text", b"\x91" * 60_000, [], 1),
         ]
-        with browser(server) as client:
-            page.send(client, *messages)
-            assert (page.dropdown.value, server.refused) == ("slow", len(messages))
-            page.send(client, update(page.dropdown, "fast"))
-            assert page.dropdown.value == "fast"
+        page.send(*messages)
+        assert (page.dropdown.value, server.refused) == ("slow", len(messages))
+        page.use(("Speed", "fast"))
+        assert page.dropdown.value == "fast"
 
 
 def test_a_long_message_ends_its_own_connection_only() -> None:
-    with viser_page() as server:
-        page = Controlled(server)
-        with browser(server) as other:
-            with pytest.raises(ConnectionClosed), browser(server) as client:
-                client.send(b"x" * (MAX_MESSAGE + 1))
-                while True:
-                    client.recv(timeout=30.0)
-            page.send(other, update(page.dropdown, "fast"))
-            assert page.dropdown.value == "fast"
+    with viser_page() as server, Controlled(server) as page:
+        with browser(server) as client:
+            client.send(b"x" * (MAX_MESSAGE + 1))
+            client.wait_for_end()
+        page.use(("Speed", "fast"))
+        assert page.dropdown.value == "fast"
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(10))
 def test_no_changed_message_ends_a_connection_or_gives_a_control_a_value_that_it_cannot_have(seed: int) -> None:
     draw = random.Random(seed)
-    values = [
-        math.nan,
-        math.inf,
-        -1,
-        2**63,
-        2**64 - 1,
-        "",
-        "\0",
-        "fast",
-        "Play",
-        None,
-        True,
-        [],
-        {},
-        b"\xff",
-        1e308,
-        "x" * 2_000,
-    ]
+    values = [math.nan, math.inf, -1, 2**63, 2**64 - 1, "", "\0", "fast", "Play", None, True, [], {}, b"\xff", 1e308]
+    values.append("x" * 2_000)
 
     def changed(message: Any) -> Any:
         message = dict(message)
@@ -260,16 +228,14 @@ def test_no_changed_message_ends_a_connection_or_gives_a_control_a_value_that_it
             encoded[draw.randrange(len(encoded))] = draw.randrange(256)
         return bytes(encoded[: draw.randrange(1, len(encoded) + 1)] if draw.random() < 0.2 else encoded)
 
-    with viser_page() as server:
-        page = Controlled(server)
-        with browser(server) as client:
-            for _ in range(20):
-                sound = [CAMERA, CLICK, *(update(control, "fast") for control in page.all)]
-                page.send(client, *(changed(draw.choice(sound)) for _ in range(50)))
-                speed, time, text, mode = page.values()
-                assert speed in ("slow", "fast")
-                assert 0.0 <= time <= 10.0  # type: ignore[operator]
-                assert len(text) <= MAX_TEXT  # type: ignore[arg-type]
-                assert mode in ("Pause", "Play")
-            page.send(client, update(page.dropdown, "slow"), update(page.dropdown, "fast"))
-            assert page.dropdown.value == "fast"
+    with viser_page() as server, Controlled(server) as page:
+        for _ in range(20):
+            sound = [CAMERA, CLICK, *(page.browser.update(label, "fast") for label in page.labels)]
+            page.send(*(changed(draw.choice(sound)) for _ in range(50)))
+            speed, time, text, mode = page.values()
+            assert speed in ("slow", "fast")
+            assert 0.0 <= time <= 10.0  # type: ignore[operator]
+            assert len(text) <= MAX_TEXT  # type: ignore[arg-type]
+            assert mode in ("Pause", "Play")
+        page.use(("Speed", "slow"), ("Speed", "fast"))
+        assert page.dropdown.value == "fast"

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from tfbus import InvalidRobotError, Joint, Mimic, Transform
+from tfbus.robot import Box, Cylinder, Mesh, Sphere, Visual, read_visuals
 from tfbus.robot.model import MAX_DEPTH, read_urdf
 
 LINKS = '<link name="a"/><link name="b"/>'
@@ -72,22 +73,6 @@ def test_limits_are_read_only_for_kinds_that_have_limits(kind: str) -> None:
     assert (found.lower, found.upper) == (None, None)
 
 
-def test_a_revolute_joint_without_a_limit_has_none() -> None:
-    assert (only_joint(kind="revolute").lower, only_joint(kind="revolute").upper) == (None, None)
-
-
-def test_roll_pitch_and_yaw_are_about_fixed_axes() -> None:
-    found = only_joint('<origin rpy="0.1 -0.2 0.3"/>').origin
-    x, y, z = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    turns = [Transform.from_axis_angle(axis, angle) for axis, angle in ((z, 0.3), (y, -0.2), (x, 0.1))]
-    assert found.is_close(turns[0] @ turns[1] @ turns[2])
-
-
-@pytest.mark.parametrize("kind", ["fixed", "floating"])
-def test_the_zero_axis_of_a_joint_without_an_axis_is_ignored(kind: str) -> None:
-    assert only_joint('<axis xyz="0 0 0"/>', kind) == only_joint("", kind)
-
-
 def test_a_source_with_a_bracket_is_text_and_any_other_a_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = robot('<link name="küche"/>')
     path = tmp_path / "robot.urdf"
@@ -144,18 +129,6 @@ KNOWN_ELSEWHERE = [
 def test_unknown_parts_of_a_link_are_ignored_silently(inside: str, capfd: pytest.CaptureFixture[str]) -> None:
     assert read_urdf(robot(f'<link name="a" type="laser">{inside}</link>')).links == ("a",)
     assert capfd.readouterr() == ("", "")
-
-
-def test_unknown_parts_of_a_joint_are_ignored_silently(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    assert only_joint('<hint x="1"/><origin xyz="1 0 0" frame="a"/>') == only_joint('<origin xyz="1 0 0"/>')
-    assert capfd.readouterr() == ("", "")
-
-
-def test_a_namespace_for_all_elements_changes_nothing() -> None:
-    plain = robot(LINKS, joint('<origin xyz="1 0 0"/>'))
-    assert read_urdf(plain.replace("<robot", '<robot xmlns="http://example.org/robots"')) == read_urdf(plain)
 
 
 @pytest.mark.parametrize(
@@ -265,10 +238,6 @@ def test_elements_may_be_nested_as_deep_as_the_limit() -> None:
         assert "nested" in problem(robot(before, "<x>" * MAX_DEPTH, "</x>" * MAX_DEPTH))
 
 
-def test_a_name_of_several_lines_makes_an_error_of_one() -> None:
-    assert problem(robot('<joint name="a&#10;b"/>')).startswith('in <joint name="a\\nb">: ')
-
-
 def test_an_error_about_an_element_pickles() -> None:
     with pytest.raises(InvalidRobotError) as caught:
         read_urdf(robot(joint('<origin xyz="1 2 x"/>')))
@@ -303,3 +272,72 @@ def test_reading_does_not_depend_on_asserts() -> None:
         [sys.executable, "-O", "-c", script], capture_output=True, text=True, check=True, env=os.environ
     )
     assert done.stdout == '<joint name="j">\n' * 2
+
+
+def linked(visuals: str, materials: str = "") -> str:
+    return f'<robot name="r">{materials}<link name="base">{visuals}</link></robot>'
+
+
+def shaped(shape: str, rest: str = "") -> str:
+    return linked(f"<visual><geometry>{shape}</geometry>{rest}</visual>")
+
+
+@pytest.mark.parametrize(
+    ("text", "shape"),
+    [
+        ('<box size="1 2 3"/>', Box((1.0, 2.0, 3.0))),
+        ('<cylinder radius="0.5" length="2"/>', Cylinder(0.5, 2.0)),
+        ('<sphere radius="0.5"/>', Sphere(0.5)),
+        ('<mesh filename="package://p/a.stl"/>', Mesh("package://p/a.stl")),
+        ('<mesh filename="a.stl" scale="1 2 0.5"/>', Mesh("a.stl", (1.0, 2.0, 0.5))),
+    ],
+)
+def test_every_shape_is_read(text: str, shape: Box | Cylinder | Sphere | Mesh) -> None:
+    assert read_visuals(shaped(text)) == [Visual("base", shape)]
+
+
+def test_a_visual_has_the_origin_of_its_shape() -> None:
+    [visual] = read_visuals(shaped('<sphere radius="1"/>', '<origin xyz="1 2 3" rpy="0 0 0.5"/>'))
+    assert visual.origin.is_close(Transform.from_xyz_rpy((1, 2, 3), (0, 0, 0.5)))
+
+
+def test_the_colour_is_its_own_or_that_of_the_material_it_names() -> None:
+    material = '<material name="{}">{}</material>'
+    red, blue = '<color rgba="1 0 0 1"/>', '<color rgba="0 0 1 0.5"/>'
+
+    def colour(inside: str, outside: str) -> tuple[float, ...] | None:
+        ball = '<visual><geometry><sphere radius="1"/></geometry>'
+        [visual] = read_visuals(linked(f"{ball}{inside}</visual>", outside))
+        return visual.colour
+
+    assert colour(material.format("paint", red), "") == (1.0, 0.0, 0.0, 1.0)
+    assert colour('<material name="paint"/>', material.format("paint", blue)) == (0.0, 0.0, 1.0, 0.5)
+    assert colour(material.format("paint", red), material.format("paint", blue)) == (1.0, 0.0, 0.0, 1.0)
+    assert colour('<material name="other"/>', material.format("paint", blue)) is None
+    assert colour(material.format("paint", '<color rgba="2 -1 0 1"/>'), "") == (1.0, 0.0, 0.0, 1.0)
+
+
+def test_a_link_has_any_number_of_visuals_in_the_order_of_the_file() -> None:
+    ball = '<visual><geometry><sphere radius="{}"/></geometry></visual>'
+    text = linked(ball.format(1) + '<visual><geometry><capsule radius="9"/></geometry></visual>' + ball.format(2))
+    assert [visual.shape for visual in read_visuals(text)] == [Sphere(1.0), Sphere(2.0)]
+    assert read_visuals(linked("")) == []
+
+
+@pytest.mark.parametrize(
+    "shape", ['<sphere radius="nan"/>', '<box size="1 inf 1"/>', '<mesh filename="a" scale="nan 1 1"/>']
+)
+def test_a_size_that_is_not_finite_names_its_link(shape: str) -> None:
+    with pytest.raises(InvalidRobotError, match=r'<link name="base">.*not finite'):
+        read_visuals(shaped(shape))
+
+
+def test_an_origin_that_is_not_finite_names_its_link() -> None:
+    with pytest.raises(InvalidRobotError, match='<link name="base">: origin'):
+        read_visuals(shaped('<sphere radius="1"/>', '<origin xyz="nan 0 0"/>'))
+
+
+def test_a_file_is_read_as_its_text_is(tmp_path: Path) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_text(shaped('<sphere radius="2"/>'))
+    assert read_visuals(path) == read_visuals(str(path)) == [Visual("base", Sphere(2.0))]

@@ -1,0 +1,230 @@
+""""""
+
+import math
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from support.samples import over, static, tree_of
+
+from tfbus import SECOND, Transform, TransformStamped, TransformTree
+from tfbus.errors import UnknownFrameError
+from tfbus.plot import Reception, plot_gaps, plot_path, plot_transforms
+from tfbus.plot.plots import line_styles, new_figure, show_in_window, spans_heard
+
+pytest.importorskip("matplotlib", reason="plots need matplotlib")
+
+
+TREE = tree_of(*over("map", "a", (0, 4 * SECOND), speed=1e-9), static("a", "b", 1.0))
+
+
+def test_a_path_from_above_has_equal_scales_and_names_the_target() -> None:
+    [axes] = plot_path(TREE, "map", "a", "b").axes
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x in map [m]", "y in map [m]")
+    assert axes.get_aspect() == 1.0
+    paths = [line for line in axes.lines if line.get_linestyle() != "None"]
+    assert [line.get_label() for line in paths] == ["a", "b"]
+    ends = [np.asarray(line.get_xdata())[[0, -1]].tolist() for line in paths]
+    assert ends == [[0.0, 4.0], [1.0, 5.0]]
+
+
+def test_a_circle_marks_the_start_and_a_square_the_end() -> None:
+    [axes] = plot_path(TREE, "map", "b").axes
+    marks = {line.get_marker(): np.asarray(line.get_xdata()).tolist() for line in axes.lines[1:]}
+    assert marks == {"o": [1.0], "s": [5.0]}
+
+
+def test_the_lines_have_colours_of_their_own_and_a_legend() -> None:
+    [axes] = plot_path(TREE, "map", "a", "b").axes
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]
+    colours = [line.get_color() for line in axes.lines]
+    assert colours == [colours[0]] * 3 + [colours[3]] * 3
+    assert colours[0] != colours[3]
+    assert axes.xaxis.get_gridlines()[0].get_visible()
+    assert axes.get_adjustable() == "datalim"
+
+
+def test_an_instant_without_an_answer_is_neither_start_nor_end() -> None:
+    tree = tree_of(*over("map", "a", (SECOND, 3 * SECOND), speed=1e-9), *over("map", "b", (0, 4 * SECOND)), keep=None)
+    [axes] = plot_path(tree, "b", "a").axes
+    marks = {line.get_marker(): np.asarray(line.get_xdata()).tolist() for line in axes.lines[1:]}
+    assert [len(places) for places in marks.values()] == [1, 1]
+    assert all(np.isfinite(places).all() for places in marks.values())
+
+
+def test_three_dimensions_have_three_axes() -> None:
+    [axes] = plot_path(TREE, "map", "a", three_d=True).axes
+    assert axes.name == "3d"
+    assert axes.get_zlabel() == "z in map [m]"  # type: ignore[attr-defined]
+
+
+pytest.importorskip("matplotlib", reason="plots need matplotlib")
+
+
+def heard(*seconds: float, static: bool = False, delay: float = 0.5) -> Reception:
+    received = np.array([round(second * SECOND) for second in seconds], np.int64)
+    return Reception("base", received - round(delay * SECOND), received, static)
+
+
+def spans(frame: Reception) -> list[tuple[float, float]]:
+    return [(begin / SECOND, length / SECOND) for begin, length in spans_heard(frame)]
+
+
+def bars(axes: Axes) -> float:
+    """The number of values in a histogram."""
+    return sum(patch.get_height() for patch in axes.patches if isinstance(patch, Rectangle))
+
+
+def test_a_pause_of_more_than_three_usual_periods_is_a_gap() -> None:
+    assert spans(heard(0, 1, 2, 5, 6, 7)) == [(0, 7)]
+    assert spans(heard(0, 1, 2, 5.5, 6.5, 7.5)) == [(0, 2), (5.5, 2)]
+
+
+def test_a_frame_that_was_heard_once_or_never_has_a_point_or_nothing() -> None:
+    assert spans(heard(3)) == [(3, 0)]
+    assert spans(heard()) == []
+    assert spans(heard(1, 1, 1, 9)) == [(1, 0), (9, 0)]
+
+
+def test_the_figure_has_strips_periods_and_delays() -> None:
+    figure = plot_gaps({"base": heard(10, 11, 12, 20, 21), "lidar": heard(static=True)})
+    strips, periods, delays = figure.axes
+    assert [label.get_text() for label in strips.get_yticklabels()] == ["base", "lidar"]
+    drawn = [(np.asarray(line.get_xdata()).tolist(), line.get_linestyle()) for line in strips.lines]
+    assert drawn == [([0.0, 2.0], "-"), ([10.0, 11.0], "-"), ([0.0, 11.0], ":")]
+    assert (periods.get_xlabel(), delays.get_xlabel()) == ("period [ms]", "delay [ms]")
+    assert bars(periods) == 4
+    assert bars(delays) == 5
+
+
+def test_each_frame_has_a_row_and_each_axes_its_names_and_scale() -> None:
+    figure = plot_gaps({"base": heard(10, 11, 12, 20, 21), "lidar": heard(static=True)})
+    strips, periods, delays = figure.axes
+    assert figure.get_size_inches().tolist() == pytest.approx([11.0, 3.4])
+    assert (strips.get_xlabel(), strips.get_ylim()) == ("time from the start [s]", (1.5, -0.5))
+    assert strips.get_title() == "heard (static: dotted)"
+    assert [np.asarray(line.get_ydata()).tolist() for line in strips.lines] == [[0, 0], [0, 0], [1, 1]]
+    heard_for, _, static = strips.lines
+    assert heard_for.get_linewidth() > static.get_linewidth() > 1.0
+    assert heard_for.get_color() != static.get_color()
+    # It must not look longer than it was.
+    assert heard_for.get_solid_capstyle() == "butt"
+    assert (strips.xaxis.get_gridlines()[0].get_visible(), strips.yaxis.get_gridlines()[0].get_visible()) == (1, 0)
+    for axes, least, most in ((periods, 1_000.0, 8_000.0), (delays, 500.0, 500.0)):
+        assert (axes.get_ylabel(), axes.get_yscale()) == ("samples", "log")
+        assert axes.xaxis.get_gridlines()[0].get_visible()
+        full = [patch for patch in axes.patches if isinstance(patch, Rectangle) and patch.get_height()]
+        assert full[0].get_x() - 1e-6 <= least <= full[0].get_x() + full[0].get_width() + 1e-6
+        assert full[-1].get_x() - 1e-6 <= most <= full[-1].get_x() + full[-1].get_width() + 1e-6
+
+
+def test_no_frame_is_an_error() -> None:
+    with pytest.raises(ValueError, match="no frame"):
+        plot_gaps({})
+
+
+pytest.importorskip("matplotlib", reason="plots need matplotlib")
+
+
+def turning() -> TransformTree:
+    """A frame that turns by 400 degrees about z in four seconds, as it moves along x at 1 m/s."""
+    tree = TransformTree()
+    for step in range(41):
+        pose = Transform.from_xyz_rpy((step / 10, 2.0, 3.0), (0.0, 0.0, math.radians(10 * step)))
+        tree.insert(TransformStamped("map", "base", step * SECOND // 10, pose))
+    return tree
+
+
+def test_each_axes_has_one_coordinate_of_each_frame_with_its_unit() -> None:
+    figure = plot_transforms(turning(), "map", "base")
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels == ["x [m]", "roll [deg]", "y [m]", "pitch [deg]", "z [m]", "yaw [deg]"]
+    assert [axes.get_xlabel() for axes in figure.axes][-2:] == ["time from the start [s]"] * 2
+    x, _, y, _, z, yaw = (axes.lines[0] for axes in figure.axes)
+    assert np.allclose(x.get_ydata(), x.get_xdata())
+    assert set(np.asarray(y.get_ydata()).tolist()) == {2.0}
+    assert set(np.asarray(z.get_ydata()).tolist()) == {3.0}
+    seconds, angles = np.asarray(yaw.get_xdata()), np.asarray(yaw.get_ydata())
+    known = ~np.isnan(angles)
+    wanted = (100.0 * seconds + 180.0) % 360.0 - 180.0
+    assert np.abs((angles - wanted + 180.0) % 360.0 - 180.0)[known].max() < 1e-6
+    # One break, where the angle passes 180 degrees.
+    assert np.count_nonzero(~known) == 1
+
+
+def test_several_frames_and_recordings_have_lines_and_names_of_their_own() -> None:
+    tree = tree_of(*over("map", "a", (0, SECOND)), static("a", "b", 1.0))
+    figure = plot_transforms([("first", tree), ("second", tree)], "map", "a", "b")
+    lines = figure.axes[0].lines
+    assert [line.get_label() for line in lines] == ["a, first", "b, first", "a, second", "b, second"]
+    assert len({line.get_color() for line in lines}) == 4
+    assert figure.get_suptitle() == "in map"
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [str(line.get_label()) for line in lines]
+
+
+def test_changes_of_rounding_do_not_fill_an_axis() -> None:
+    tree = TransformTree()
+    for step in range(4):
+        tree.insert(TransformStamped("map", "base", step * SECOND, Transform((1e-17 * (step % 2), 1e-5 * step, 0.0))))
+    x, _, y, *_ = plot_transforms(tree, "map", "base").axes
+    low, high = x.get_ylim()
+    assert (low, high) == pytest.approx((-5e-7, 5e-7))
+    low, high = y.get_ylim()
+    assert 3e-5 <= high - low <= 4e-5
+
+
+def test_a_given_figure_is_drawn_in() -> None:
+    figure = Figure()
+    assert plot_transforms(turning(), "map", "base", figure=figure) is figure
+    assert len(figure.axes) == 6
+
+
+def test_no_source_no_tree_and_unknown_frames_are_errors() -> None:
+    with pytest.raises(ValueError, match="source"):
+        plot_transforms(turning(), "map")
+    with pytest.raises(ValueError, match="tree"):
+        plot_transforms([], "map", "base")
+    with pytest.raises(UnknownFrameError):
+        plot_transforms(turning(), "map", "bass")
+
+
+pytest.importorskip("matplotlib", reason="plots need matplotlib")
+
+
+@pytest.mark.parametrize(("display", "why"), [("", "there is no display"), (":0", "has no window here")])
+def test_without_a_window_nothing_is_drawn(display: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plt, "get_backend", lambda: "agg")
+    monkeypatch.setenv("DISPLAY", display)
+    with pytest.raises(RuntimeError, match=why):
+        show_in_window(lambda _: pytest.fail("drawn"))
+
+
+def test_the_figure_is_drawn_and_then_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[object] = []
+    plt.switch_backend("agg")
+    monkeypatch.setattr(plt, "get_backend", lambda: "tkagg")
+    monkeypatch.setattr(plt, "show", lambda: drawn.append("shown"))
+    show_in_window(drawn.append)
+    figure, last = drawn
+    assert isinstance(figure, Figure)
+    assert last == "shown"
+    plt.close("all")
+
+
+pytest.importorskip("matplotlib", reason="plots need matplotlib")
+
+
+def test_a_given_figure_is_drawn_in_and_otherwise_there_is_a_new_one() -> None:
+    figure = Figure()
+    assert new_figure(figure, 1.0, 2.0) is figure
+    assert new_figure(None, 3.0, 2.0).get_size_inches().tolist() == [3.0, 2.0]
+
+
+def test_no_two_of_28_lines_look_alike() -> None:
+    styles = [tuple(style.items()) for style in line_styles(28)]
+    assert len(set(styles)) == len(styles) == 28
