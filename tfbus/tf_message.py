@@ -213,7 +213,7 @@ def decode(
 
 
 def decode_in_parts(
-    payload: bytes, most: int, kind: type[SampleT], bare_names: bool = False
+    payload: bytes, most: int, kind: type[SampleT], bare_names: bool = False, tags: Iterable[Tag] | None = None
 ) -> Iterator[Decoded[SampleT]]:
     """Decode the samples of a message, at most so many at a time; the parameters are those of `decode`.
 
@@ -223,10 +223,9 @@ def decode_in_parts(
         Once the samples that are sound up to there are decoded.
     """
     body, layout, count = _open(payload)
-    end = _FIRST
-    for first in range(0, count, most):
-        tags = repeat(("", False), min(most, count - first))
-        decoded, end = _transforms(body, layout, tags, kind, bare_names, end)
+    end, rest = _FIRST, iter(_as_tags(tags, count))
+    for _ in range(0, count, most):
+        decoded, end = _transforms(body, layout, islice(rest, most), kind, bare_names, end)
         yield decoded
     _check_end(body, end)
 

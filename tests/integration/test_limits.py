@@ -28,6 +28,7 @@ BOUNDS = [
     "cli.commands.query.MAX_ROWS",
     "tf_message.MAX_NAME",
     "links._message.MAX_BYTES",
+    "links._message.MAX_SAMPLES",
     "links._attachment.MAX_BYTES",
     "links._attachment.MAX_ENTRIES",
     "links.zenoh._settings.UNSENT",

@@ -16,10 +16,12 @@ from tfbus.links._message import (
     _LONGEST_AUTHORITY,
     FULL_MESSAGE,
     MAX_BYTES,
+    MAX_SAMPLES,
     Message,
     MessageWriter,
     can_hold,
     read_message,
+    read_message_in_parts,
     write_answer,
 )
 from tfbus.links._state import StateStep
@@ -214,6 +216,17 @@ def test_a_batch_too_large_for_a_message_is_counted_and_its_neighbours_go_out() 
     assert writer.sent() == [[moving("map", "a", 1)], [moving("map", "c", 1)]]
     assert writer.report.not_sent == {"oversized": 3_000}
     assert len(writer.refused) == 1
+
+
+def test_a_batch_of_more_samples_than_a_bus_publishes_in_one_turn_is_neither_sent_nor_taken() -> None:
+    samples = tuple(moving("map", f"{number}", 1) for number in range(MAX_SAMPLES + 1))
+    writer = Writer()
+    writer.add(*samples)
+    assert writer.write() == []
+    assert writer.report.not_sent == {"oversized": MAX_SAMPLES + 1}
+    attachment = pack(1, [PublishedBatch(ORIGIN, 1, (("", False, len(samples)),))])
+    with pytest.raises(MalformedMessageError, match="oversized"):
+        list(read_message_in_parts(encode(samples), attachment))
 
 
 # Refusals.

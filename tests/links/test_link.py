@@ -17,7 +17,9 @@ from support.wires import WireCarrier
 from tfbus import Bus, BusClosedError, PeerJoined, PeerLost, PeerRejected, SimulatedClock
 from tfbus.links import Link, _endpoint
 from tfbus.links._carrier import SendReport
+from tfbus.links._entries import OutgoingBatch
 from tfbus.links._inbox import ReceivedMessage
+from tfbus.links._message import MAX_SAMPLES, MessageWriter, read_message_in_parts
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.tf_message import MalformedMessageError
@@ -333,6 +335,51 @@ async def test_the_rest_of_a_split_message_is_dropped_when_the_clock_jumps_back(
             carrier.receive(Received("driver", ForeignMessage(False, [ARM._replace(child="last")])))
             await until(lambda: link.statistics().received_messages == 2)
             assert link.statistics().received_samples < 50
+
+
+class PartsCarrier(LoggedCarrier):
+    """Reads messages of links of tfbus, large ones in parts."""
+
+    def split(self, content: Any) -> Iterator[Any]:
+        return read_message_in_parts(*content)
+
+    def read(self, content: Any) -> ReceivedMessage:
+        return content  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize(("batches", "samples", "turns"), [(1, MAX_SAMPLES, 20), (4_000, 1, 20)])
+async def test_a_large_message_between_links_takes_many_turns_and_each_batch_of_it_is_seen_whole(
+    batches: int, samples: int, turns: int
+) -> None:
+    carrier, heard = PartsCarrier(), []
+    entries = [
+        OutgoingBatch(b"an origin, a bus", n, [moving("map", f"f{n}/{i}", 1) for i in range(samples)])  # type: ignore[arg-type]
+        for n in range(batches)
+    ]
+    (message,) = MessageWriter(SendReport(print)).write(entries)
+    # A second look at the clock ends a turn.
+    with Bus(SimulatedClock()) as bus:
+        bus.subscribe(lambda batch: heard.append(len(batch)))
+        async with Link(bus, "world", carrier, now=slow_clock(0.0005)) as link:
+            carrier.receive(Received("peer", (message.payload, message.attachment)))
+            taken = 0
+            while sum(heard) < batches * samples:
+                taken += 1
+                await anyio.lowlevel.checkpoint()
+            assert link.statistics().received_messages == 1
+    assert heard == [samples] * batches
+    assert taken >= turns
+
+
+async def test_nothing_of_a_large_message_that_is_malformed_at_its_end_is_taken() -> None:
+    carrier = PartsCarrier()
+    batch = OutgoingBatch(b"an origin, a bus", 1, tuple(moving("map", f"f{number}", 1) for number in range(1_000)))
+    (message,) = MessageWriter(SendReport(print)).write([batch])
+    with Bus() as bus:
+        async with Link(bus, "world", carrier) as link:
+            carrier.receive(Received("peer", (message.payload + bytes(8), message.attachment)))
+            await until(lambda: link.statistics().rejected == {"oversized": 1})
+            assert bus.statistics().samples == 0
 
 
 async def test_messages_beyond_the_capacity_are_dropped_and_counted() -> None:

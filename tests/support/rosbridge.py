@@ -66,6 +66,7 @@ class RosbridgeServer:
         self.latched: dict[str, tuple[TransformStamped, ...]] = {}
         self.port = 0
         self.silent = False
+        self.only_sends = False
         self.refuses: set[str] = set()
 
     @property
@@ -113,9 +114,12 @@ class RosbridgeServer:
         self.clients.append(client)
         try:
             async with stream:
+                text = ""
                 while True:
+                    while self.only_sends:
+                        await client.send(TextMessage("{}"))
+                        await anyio.sleep(0.01)
                     client.connection.receive_data(await stream.receive())
-                    text = ""
                     for event in client.connection.events():
                         if self.silent:
                             continue

@@ -125,6 +125,8 @@ class SplittingCarrier(Carrier, Protocol):
     def split(self, content: Any) -> Iterator[Any]:
         """The content of an item in parts, for `read` one by one; an item that is small is its only part.
 
+        It may also yield None, where other tasks may have their turn before there is a part.
+
         Raises
         ------
         MalformedMessageError

@@ -203,7 +203,7 @@ class Endpoint:
 
     def _take_live(self, sender: str, message: ReceivedMessage) -> None:
         self.inbox.receive(sender, message)
-        if self._reconciler is not None:
+        if self._reconciler is not None and not message.goes_on:
             self._reconciler.heard(sender)
 
     def _tell_history(self, question: HistoryQuestion) -> None:

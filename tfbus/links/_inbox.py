@@ -66,6 +66,8 @@ class ReceivedMessage:
         The time of the sender's clock, in ns, if it tells that.
     continues : bool
         Whether it is a later part of a message that was counted.
+    goes_on : bool
+        Whether a later part follows; the peer's state is that of `step` only after the last one.
     """
 
     entries: list[ReceivedBatch | RemovedFrame | MovingFrame]
@@ -74,6 +76,7 @@ class ReceivedMessage:
     step: StateStep | None = None
     time: int | None = None
     continues: bool = False
+    goes_on: bool = False
 
 
 class Inbox:
@@ -128,7 +131,7 @@ class Inbox:
         if missing and peer.mirror is not None:
             peer.mirror.lost_message()
         self._take(peer, message, live=message.number > 0)
-        if peer.mirror is not None and step is not None:
+        if peer.mirror is not None and step is not None and not message.goes_on:
             if step.number - peer.mirror.number > _LARGEST_GAP:
                 error = ValueError(f"a state with the number {step.number}, {peer.mirror.number} was the newest")
                 self._peers.reject(sender, "number", error)

@@ -9,18 +9,26 @@ from itertools import groupby
 
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links._attachment import PublishedBatch, pack, unpack
+from tfbus.links._attachment import Attachment, PublishedBatch, pack, unpack
 from tfbus.links._carrier import SendReport
 from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._state import StateStep
-from tfbus.tf_message import decode, encode, refusal
+from tfbus.tf_message import MIN_SIZE, MalformedMessageError, decode, decode_in_parts, encode, refusal
 
 FULL_MESSAGE = 5_000
 """A message with so many samples and removals is full; the batch that fills it is still whole."""
 MAX_BYTES = 2**22
-"""The largest message that is sent or accepted: some 30,000 samples, which keep the receiver's loop for a while."""
+"""The largest message that is sent or accepted."""
+MAX_SAMPLES = 10_000
+"""The largest batch that is sent or accepted: a bus publishes it in one turn of the loop, all or nothing."""
+MOST_AT_ONCE = 5_000
+"""So many samples of an answer are decoded in one turn."""
+_LARGE_PAYLOAD, _LARGE_ATTACHMENT = 2**15, 2**12
+"""Bytes; a message beyond one of them is read in parts."""
+_PART = 200
+"""So many samples, or entries, of a large message are decoded, or handled, before other tasks may have their turn."""
 _LONGEST_AUTHORITY = 65_535
 
 _Entry = OutgoingBatch | RemovedFrame | MovingFrame
@@ -153,9 +161,52 @@ def read_message(payload: bytes, attachment: bytes) -> ReceivedMessage:
         If the attachment or the payload is malformed, or they do not fit together.
     """
     unpacked = unpack(attachment)
+    _check_count(unpacked, payload, MOST_AT_ONCE)
     decoded = decode(payload, unpacked.tags(), ReceivedTransform)
     entries = list(_received_entries(unpacked.entries, decoded.samples))
     return ReceivedMessage(entries, unpacked.number, decoded.errors, unpacked.step, unpacked.time)
+
+
+def is_large(payload: bytes, attachment: bytes) -> bool:
+    """Whether a message takes too long for one turn of the event loop."""
+    return len(payload) > _LARGE_PAYLOAD or len(attachment) > _LARGE_ATTACHMENT
+
+
+def read_message_in_parts(payload: bytes, attachment: bytes) -> Iterator[ReceivedMessage | None]:
+    """The entries that a large message holds, some at a time, with each batch whole; first None for each turn.
+
+    Nothing of a malformed message is a part: all of it is decoded before the first one.
+
+    Raises
+    ------
+    MalformedMessageError
+        As `read_message`.
+    """
+    unpacked = unpack(attachment)
+    _check_count(unpacked, payload, MAX_SAMPLES)
+    yield None
+    samples: list[ReceivedTransform | None] = []
+    errors: list[InvalidTransformError] = []
+    for decoded in decode_in_parts(payload, _PART, ReceivedTransform, tags=unpacked.tags()):
+        samples += decoded.samples
+        errors += decoded.errors
+        yield None
+    gathered: list[ReceivedBatch | RemovedFrame | MovingFrame] = []
+    size, continues, time = 0, False, unpacked.time
+    for entry in _received_entries(unpacked.entries, samples):
+        if size >= _PART:
+            yield ReceivedMessage(gathered, unpacked.number, errors, unpacked.step, time, continues, goes_on=True)
+            gathered, size, errors, continues, time = [], 0, [], True, None
+        gathered.append(entry)
+        size += 1 + (len(entry.samples) if isinstance(entry, ReceivedBatch) else 0)
+    yield ReceivedMessage(gathered, unpacked.number, errors, unpacked.step, time, continues)
+
+
+def _check_count(attachment: Attachment, payload: bytes, most: int) -> None:
+    count = sum(entry.count for entry in attachment.entries if isinstance(entry, PublishedBatch))
+    # A number that the payload cannot hold is malformed, and is told as such.
+    if most < count <= len(payload) // MIN_SIZE:
+        raise MalformedMessageError("oversized", f"a message of {count} samples, more than {most}")
 
 
 def _received_entries(
@@ -182,6 +233,8 @@ def _message(entries: Sequence[_Entry], number: int, step: StateStep | None = No
     published = [_published(entry) if isinstance(entry, OutgoingBatch) else entry for entry in entries]
     attachment = pack(number, published, step, time)
     size = len(payload) + len(attachment)
+    if len(samples) > MAX_SAMPLES:
+        raise ValueError(f"a message of {len(samples)} samples, more than {MAX_SAMPLES}")
     if size > MAX_BYTES:
         raise ValueError(f"a message of {len(samples)} samples has {size} bytes, more than {MAX_BYTES}")
     return Message(payload, attachment, len(samples), number)

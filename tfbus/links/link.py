@@ -266,7 +266,9 @@ class Link:
             item = self._next_item()
             if item is None:
                 return
-            self._endpoint.handle(item)
+            # A large batch is decoded over several turns, and then handled at once.
+            if item.content is not None:
+                self._endpoint.handle(item)
             if self._budget.spent:
                 # Other tasks get their turn first.
                 self._received.wake()

@@ -242,6 +242,28 @@ async def test_one_message_of_thousands_of_transforms_is_published_in_parts_in_i
 
 
 @pytest.mark.thorough
+async def test_a_server_that_sends_and_never_reads_is_left_and_asked_again(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name, value in (("FIRST_PAUSE", 0.01), ("SILENCE", 0.5)):
+        monkeypatch.setattr(rosbridge_link, name, value)
+    async with rosbridge_server() as server:
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url) as link:
+                await until(lambda: len(server.operations("advertise")) == 1)
+                server.only_sends = True
+                # More than the buffers of TCP hold.
+                for stamp in range(60):
+                    bus.publish([moving("map", f"frame{number}", stamp) for number in range(1_000)])
+                    await anyio.lowlevel.checkpoint()
+                await until(lambda: "has read nothing for 0.5 s" in caplog.text)
+                server.only_sends = False
+                await until(lambda: len(server.operations("subscribe")) == 4)
+                await server.say(moving("map", "base", 5))
+                await until(lambda: link.statistics().received_samples == 1)
+
+
+@pytest.mark.thorough
 async def test_a_server_that_sends_huge_messages_is_cut_off_and_asked_again() -> None:
     async with rosbridge_server() as server:
         with Bus() as bus:

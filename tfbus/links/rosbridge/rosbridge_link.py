@@ -396,7 +396,11 @@ class RosbridgeCarrier(RosCarrier):
             await anyio.sleep(SILENCE / 4)
             if monotonic() - socket.heard > SILENCE:
                 raise ConnectionResetError(f"nothing has come for {SILENCE:g} s")
-            await socket.ping()
+            with anyio.move_on_after(SILENCE) as waited:
+                await socket.ping()
+            if waited.cancelled_caught:
+                # It sends, so it is not silent.
+                raise ConnectionResetError(f"it has read nothing for {SILENCE:g} s")
 
     async def _ask_again(self) -> None:
         """Subscribe once more while a lookup waits, to the static frames, and to the moving ones if none has come.

@@ -1,7 +1,8 @@
 """The carrier of links over zenoh."""
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from functools import partial
+from typing import Any
 
 import anyio
 import anyio.to_thread
@@ -11,7 +12,15 @@ from tfbus._aio.task_groups import close_task_group
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._carrier import SendReport
 from tfbus.links._inbox import ReceivedMessage
-from tfbus.links._message import Message, MessageWriter, can_hold, read_message, write_answer
+from tfbus.links._message import (
+    Message,
+    MessageWriter,
+    can_hold,
+    is_large,
+    read_message,
+    read_message_in_parts,
+    write_answer,
+)
 from tfbus.links._outbox import Turn
 from tfbus.links._part_writer import PartWriter
 from tfbus.links._receive_queue import HistoryQuestion, Question, Received
@@ -78,9 +87,13 @@ class ZenohCarrier:
             if self._put(message) and message.number:
                 self._report.sent(message.samples)
 
-    def read(self, content: tuple[bytes, bytes]) -> ReceivedMessage:
-        """Decode a payload and its attachment."""
-        return read_message(*content)
+    def split(self, content: Any) -> Iterator[Any]:
+        """The parts of a large message, none of which is half a batch; anything else is its only part."""
+        return read_message_in_parts(*content) if type(content) is tuple and is_large(*content) else iter((content,))
+
+    def read(self, content: tuple[bytes, bytes] | ReceivedMessage) -> ReceivedMessage:
+        """Decode a payload and its attachment, unless `split` has done so."""
+        return content if isinstance(content, ReceivedMessage) else read_message(*content)
 
     def can_hold(self, sample: TransformStamped) -> bool:
         """Whether a message can hold a sample."""
