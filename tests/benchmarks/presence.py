@@ -86,7 +86,7 @@ def measure(settle: float, bare: bool = False, router: bool = False, peers: int 
     meet as its clients.
     """
     # The other processes do not find it.
-    from support.programs import free_address
+    from support.processes import free_address
 
     task = {
         "address": free_address(),

@@ -51,7 +51,7 @@ async def live(
 def measure(processes: int, frames: int = 20, rate: float = 20.0, lease: float | None = None) -> list[float]:
     """Seconds from the last start until each process has all static frames; infinite for one that has not."""
     # The other processes do not find it.
-    from support.programs import free_address
+    from support.processes import free_address
 
     task: dict[str, Any] = {
         "processes": processes,

@@ -5,8 +5,20 @@ from typing import Any, assert_type
 import numpy as np
 import pytest
 from hypothesis import given
-from support.ros_messages import Header, Point, PointMessage, Time
-from support.stamped_data import ANSWER, MOVABLE, POINTS, SCAN, arrays_of, contents, name_of, numbers
+from support.stamped_data import (
+    ANSWER,
+    MOVABLE,
+    POINTS,
+    SCAN,
+    Header,
+    Point,
+    PointMessage,
+    Time,
+    arrays_of,
+    contents,
+    name_of,
+    numbers,
+)
 from support.strategies import transforms
 
 from tfbus import LATEST, Latest, PointCloud, PointStamped, Transform, TransformStamped, do_transform

@@ -17,8 +17,7 @@ from urllib.parse import quote
 import anyio
 import httpx
 import pytest
-from support.processes import new_domain
-from support.programs import Program
+from support.processes import Program, new_domain
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin

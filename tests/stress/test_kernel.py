@@ -13,9 +13,9 @@ import anyio
 import anyio.lowlevel
 import numpy as np
 import pytest
+from support.asking import threads_that
 from support.both_kernels import COMPILED, bits, needs_both, sample_class
 from support.samples import moving, over, static
-from support.threads import threads_that
 
 from tfbus import LATEST, Buffer, Bus, TransformLookupError, TransformTree
 

@@ -3,7 +3,6 @@
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.link_model import Model, Step, frames_of, steps_of
 from support.wires import (
     CHAIN,
     CIRCLE,
@@ -14,8 +13,12 @@ from support.wires import (
     TRIANGLE,
     TWO_BRIDGES,
     Graph,
+    Model,
     Network,
+    Step,
+    frames_of,
     latched,
+    steps_of,
 )
 
 from tfbus import Buffer, Bus, SimulatedClock

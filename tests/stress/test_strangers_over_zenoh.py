@@ -13,8 +13,7 @@ import anyio
 import anyio.to_thread
 import pytest
 import zenoh
-from support.processes import PATIENCE, new_domain, until
-from support.programs import free_address
+from support.processes import PATIENCE, free_address, new_domain, until
 from support.samples import moving, static
 
 from tfbus import LATEST, Buffer, Bus, RemoteLookupError, SimulatedClock

@@ -1,5 +1,5 @@
 import pytest
-from support.live_trees import live_tree
+from support.histories import live_tree
 from support.samples import moving, static
 
 from tfbus import LATEST, Question, TransformStamped

@@ -5,7 +5,7 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from support.live_trees import live_tree, tree_over
+from support.histories import live_tree, tree_over
 from support.samples import moving, static
 
 from tfbus import LATEST, Question, TransformLookupError
