@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from support.allocations import peak_of
+from support.processes import peak_of
 from support.samples import moving, tree_of
 
 import tfbus

@@ -13,7 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from support import strategies as some
-from support.allocations import peak_of
+from support.processes import peak_of
 from support.samples import moving
 
 from tfbus import SECOND, InvalidTransformError, Transform, TransformStamped

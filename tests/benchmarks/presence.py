@@ -1,13 +1,9 @@
 """The cost of knowing peers that do nothing: one link, and some peers in two other processes.
 
-``python tests/benchmarks/presence.py --peers 50`` measures links, and with ``--bare`` zenoh's sessions with the same
-settings and nothing on them: the floor. ``--router`` has the links meet as clients of a router. The peers know the
-measured link, but not each other, so that the machine carries them.
+The peers know the measured link, but not each other, so that the machine carries them.
 """
 
-import argparse
 import json
-import socket
 import subprocess
 import sys
 import time
@@ -83,25 +79,19 @@ async def be_measured(task: dict[str, Any]) -> None:
         print(json.dumps({"cores": cores, "peers": known(ends[0])}), flush=True)
 
 
-def free_address() -> str:
-    """An address of the loopback at which nobody listens."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+def measure(settle: float, bare: bool = False, router: bool = False, peers: int = 50, seconds: float = 30.0) -> float:
+    """The user and system time of the measured process, in cores.
 
+    `bare` measures zenoh's sessions with the same settings and nothing on them: the floor; with a `router` the links
+    meet as its clients.
+    """
+    # The other processes do not find it.
+    from support.processes import free_address
 
-def measure(
-    peers: int = 50,
-    seconds: float = 30.0,
-    settle: float = 20.0,
-    bare: bool = False,
-    router: bool = False,
-    config: dict[str, Any] | None = None,
-) -> float:
-    """The user and system time of the measured process, in cores."""
     task = {
         "address": free_address(),
         "domain": f"presence-{uuid4().hex}",
-        "config": (config or {}) | ({"mode": "client"} if router else {}),
+        "config": {"mode": "client"} if router else {},
         "peers": peers,
         "seconds": seconds,
         "settle": settle,
@@ -110,7 +100,7 @@ def measure(
     }
 
     def start(role: str) -> subprocess.Popen[str]:
-        command = [sys.executable, __file__, "--role", role, "--task", json.dumps(task)]
+        command = [sys.executable, __file__, role, json.dumps(task)]
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     started: list[subprocess.Popen[str]] = []
@@ -138,18 +128,5 @@ def measure(
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--peers", type=int, default=50)
-    parser.add_argument("--seconds", type=float, default=30.0, help="how long is measured")
-    parser.add_argument("--settle", type=float, default=20.0, help="how long they rest before")
-    parser.add_argument("--bare", action="store_true")
-    parser.add_argument("--router", action="store_true")
-    parser.add_argument("--config", type=json.loads, default={}, help="settings of zenoh, as JSON")
-    parser.add_argument("--role", help=argparse.SUPPRESS)
-    parser.add_argument("--task", type=json.loads, help=argparse.SUPPRESS)
-    arguments = vars(parser.parse_args())
-    role, task = arguments.pop("role"), arguments.pop("task")
-    if role is None:
-        print(f"{measure(**arguments):.2%} of a core")
-    else:
-        anyio.run({"peers": be_peers, "router": be_router, "measured": be_measured}[role], task)
+    roles = {"peers": be_peers, "router": be_router, "measured": be_measured}
+    anyio.run(roles[sys.argv[1]], json.loads(sys.argv[2]))

@@ -1,13 +1,10 @@
 """Many processes with a link each that start at once: how long until every bus has every static frame.
 
-``python tests/benchmarks/start_together.py --processes 50`` tells the seconds from the last start, of each process when
-it has all of them. Each has some static frames, and as many moving ones, which it publishes all the while.
+Each has some static frames, and as many moving ones, which it publishes all the while.
 """
 
-import argparse
 import json
 import os
-import socket
 import subprocess
 import sys
 import tempfile
@@ -51,14 +48,11 @@ async def live(
                 broadcaster.send_all([("map", f"moving {number} {frame}", Transform()) for frame in range(frames)])
 
 
-def free_address() -> str:
-    """An address of the loopback at which nobody listens."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
-
-
-def measure(processes: int = 50, frames: int = 20, rate: float = 20.0, lease: float | None = None) -> list[float]:
+def measure(processes: int, frames: int = 20, rate: float = 20.0, lease: float | None = None) -> list[float]:
     """Seconds from the last start until each process has all static frames; infinite for one that has not."""
+    # The other processes do not find it.
+    from support.processes import free_address
+
     task: dict[str, Any] = {
         "processes": processes,
         "frames": frames,
@@ -67,12 +61,11 @@ def measure(processes: int = 50, frames: int = 20, rate: float = 20.0, lease: fl
         "domain": f"start-{uuid4().hex}",
         "address": free_address(),
     }
-    ends = [float("inf")] * processes
     with tempfile.TemporaryDirectory() as folder:
         # As of a package that is installed: else each process compiles all modules where no bytecode may be written.
         compiled = os.environ | {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": folder}
         subprocess.run([sys.executable, "-c", IMPORTS], env=compiled, cwd=Path(__file__).parent, check=True)
-        return _measure(task, ends, compiled)
+        return _measure(task, [float("inf")] * processes, compiled)
 
 
 def _measure(task: dict[str, Any], ends: list[float], environment: dict[str, str]) -> list[float]:
@@ -86,7 +79,7 @@ def _measure(task: dict[str, Any], ends: list[float], environment: dict[str, str
     readers = []
     try:
         for number in range(len(ends)):
-            command = [sys.executable, __file__, "--be", json.dumps(task | {"number": number})]
+            command = [sys.executable, __file__, json.dumps(task | {"number": number})]
             started.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment))
             readers.append(threading.Thread(target=read, args=(number, started[-1])))
             readers[-1].start()
@@ -107,16 +100,4 @@ def _measure(task: dict[str, Any], ends: list[float], environment: dict[str, str
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--processes", type=int, default=50)
-    parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--rate", type=float, default=20.0, help="Hz")
-    parser.add_argument("--lease", type=float, help="s; by default, that of the link")
-    parser.add_argument("--be", type=json.loads, help=argparse.SUPPRESS)
-    arguments = vars(parser.parse_args())
-    one = arguments.pop("be")
-    if one is not None:
-        anyio.run(lambda: live(**one))
-    else:
-        times = sorted(measure(**arguments))
-        print(f"half of them after {times[len(times) // 2]:.1f} s, the last after {times[-1]:.1f} s")
+    anyio.run(lambda: live(**json.loads(sys.argv[1])))

@@ -247,23 +247,6 @@ def test_stamps_in_order_on_both_kernels(benchmark: Any, table: Table, count: in
         table.compare(f"  on the {other} kernel", rounds, "transform-tree", theirs[0], unit="ns")
 
 
-@pytest.mark.parametrize("edges", [1, 3])
-def test_many_stamps_as_matrices(benchmark: Any, table: Table, edges: int) -> None:
-    """As `test_many_stamps`, up to the form that transform-tree gives."""
-    chain = "m" * edges
-    matrices = transform_tree(chain)
-    if matrices is None:
-        pytest.skip("no transform-tree to measure beside")
-    tree, source, stamps = tree_of(chain), last_of(chain), np.array(cases.questions("many, sorted"))
-    ours, theirs = take_turns(
-        benchmark,
-        timed(lambda: tree.lookup_many(BASE, source, stamps).matrices(), MANY),
-        [timed(lambda: matrices(stamps), MANY)],
-    )
-    label = f"lookup_many and matrices, {edges} edge{'s' * (edges > 1)}"
-    table.compare(label, ours, "transform-tree", theirs[0], unit="ns")
-
-
 def scattered_points() -> Points:
     return np.random.default_rng(4).uniform(-50.0, 50.0, (POINTS, 3)).astype(np.float32)
 

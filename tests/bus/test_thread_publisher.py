@@ -7,9 +7,8 @@ from typing import Any
 import anyio
 import anyio.to_thread
 import pytest
-from support.asking import Asked, settle
+from support.asking import Asked, settle, threads_that
 from support.samples import moving, static
-from support.threads import threads_that
 
 from tfbus import (
     LATEST,

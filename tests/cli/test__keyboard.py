@@ -9,8 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from support.processes import new_domain
-from support.programs import TFBUS
+from support.processes import TFBUS, new_domain
 from support.recorded import write_mcap
 from support.samples import moving
 

@@ -3,7 +3,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.programs import PATIENCE, TFBUS
+from support.processes import PATIENCE, TFBUS
 from support.recorded import SMALL
 from support.terminal import Terminal, on_a_terminal
 

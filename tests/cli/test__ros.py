@@ -3,8 +3,8 @@ import re
 from pathlib import Path
 
 import pytest
-from support.programs import start_tfbus
-from support.robot_of_ros import URDF
+from support.both_sides import URDF
+from support.processes import start_tfbus
 
 from tfbus import Bus
 from tfbus.cli._ros import is_ros, ros_link

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 from support.commands import Command, check_wrong_call
-from support.processes import new_domain
-from support.programs import PATIENCE, TFBUS, Program
+from support.processes import PATIENCE, TFBUS, Program, new_domain
 from support.recorded import SMALL, write_mcap
 from support.samples import moving
 

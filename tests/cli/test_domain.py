@@ -11,8 +11,7 @@ import anyio
 import anyio.lowlevel
 import pytest
 from support.commands import START, Command, check_wrong_call
-from support.processes import new_domain
-from support.programs import Program
+from support.processes import Program, new_domain
 from support.samples import static
 
 from tfbus import Bus, SimulatedClock, from_seconds

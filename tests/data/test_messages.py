@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.ros_messages import Header, Point, PointMessage, Time
+from support.stamped_data import Header, Point, PointMessage, Time
 
 from tfbus import (
     LATEST,

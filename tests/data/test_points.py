@@ -8,8 +8,19 @@ from typing import Any, assert_type
 import numpy as np
 import pytest
 from hypothesis import given
-from support.ros_messages import Header, Point, PointMessage, Time
-from support.stamped_data import ANSWER, MOVABLE, SCAN, arrays_of, contents, name_of, numbers
+from support.stamped_data import (
+    ANSWER,
+    MOVABLE,
+    SCAN,
+    Header,
+    Point,
+    PointMessage,
+    Time,
+    arrays_of,
+    contents,
+    name_of,
+    numbers,
+)
 from support.strategies import rotations, transforms, vectors
 
 from tfbus import (

@@ -17,34 +17,20 @@ from collections import Counter
 from collections.abc import Iterator
 
 import bags
-import recording_files
-import scenarios_changes
-import scenarios_latest
-import scenarios_names
 import scenarios_random
-import scenarios_shapes
-import scenarios_values
-import scenarios_windows
 from design_rules import annotated
 from real_tf2 import record
-from steps import Step
-from translation import TRANSLATION
+from steps import FOLDER, TRANSLATION, Step, as_text, scenarios_in
 
-BY_HAND = {
-    "shapes": scenarios_shapes.scenarios,
-    "windows": scenarios_windows.scenarios,
-    "latest": scenarios_latest.scenarios,
-    "changes": scenarios_changes.scenarios,
-    "names": scenarios_names.scenarios,
-    "values": scenarios_values.scenarios,
-}
+BY_HAND = ("shapes", "windows", "latest", "changes", "names", "values")
+"""The recordings whose steps were written by hand; to add one, write its line into the file, without an answer."""
 SEED, ROUNDS = 0, 110
 
 
 def themes(seed: int, rounds: int) -> Iterator[tuple[str, list[Step]]]:
     """The name of each recording and what tf2 answers now; a bag that is not there is left out."""
-    for name, scenarios in BY_HAND.items():
-        yield name, [record(scenario) for scenario in scenarios()]
+    for name in BY_HAND:
+        yield name, [record(scenario) for scenario in scenarios_in(FOLDER / f"{name}.json")]
     trees = scenarios_random.random_trees(seed, rounds)
     yield "random", [annotated(record(scenario), TRANSLATION) for scenario in trees]
     for name in scenarios_random.BAGS:
@@ -57,10 +43,9 @@ def themes(seed: int, rounds: int) -> Iterator[tuple[str, list[Step]]]:
 
 def write() -> int:
     """Write the recordings."""
-    recording_files.FOLDER.mkdir(exist_ok=True)
     for name, scenarios in themes(SEED, ROUNDS):
-        path = recording_files.FOLDER / f"{name}.json"
-        path.write_text(recording_files.as_text(scenarios), encoding="utf-8")
+        path = FOLDER / f"{name}.json"
+        path.write_text(as_text(scenarios), encoding="utf-8")
         print(f"{path.name}: {_summary(scenarios)}")
     return 0
 
@@ -69,8 +54,8 @@ def check() -> int:
     """Say which recordings are not what tf2 answers now."""
     differing = 0
     for name, scenarios in themes(SEED, ROUNDS):
-        path = recording_files.FOLDER / f"{name}.json"
-        same = path.is_file() and path.read_text(encoding="utf-8") == recording_files.as_text(scenarios)
+        path = FOLDER / f"{name}.json"
+        same = path.is_file() and path.read_text(encoding="utf-8") == as_text(scenarios)
         differing += not same
         print(f"{path.name}: {'as recorded' if same else 'NOT AS RECORDED'}, {_summary(scenarios)}")
     return 1 if differing else 0

@@ -1,12 +1,16 @@
-"""The steps of a scenario: samples and questions, in order, each a small dict that JSON can hold.
+"""The steps of a scenario: samples and questions, in order, each a small dict in a recording, a line of JSON.
 
 A step's first key says what is done, its value holds the arguments. The recorder adds ``"tf2"``, the real answer.
 Where tfbus differs on purpose the step names the deviation and says what tfbus answers instead.
 """
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
+
+FOLDER = Path(__file__).resolve().parent / "recordings"
 
 LATEST = "LATEST"
 SECOND = 1_000_000_000
@@ -16,6 +20,24 @@ Stamp = int | str
 Numbers = Sequence[float]
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+TRANSLATION = {
+    "LookupException": "UnknownFrameError",
+    "ConnectivityException": "DisconnectedError",
+    "TransformException: disconnected": "DisconnectedError",
+    "ExtrapolationException: future": "FutureExtrapolationError",
+    "ExtrapolationException: past": "PastExtrapolationError",
+    "ExtrapolationException: one sample, asked for the future": "FutureExtrapolationError",
+    "ExtrapolationException: one sample, asked for the past": "PastExtrapolationError",
+    "ExtrapolationException: no samples": "FutureExtrapolationError",
+    "TF_OLD_DATA": "expired",
+    "TF_SELF_TRANSFORM": "invalid",
+    "TF_NO_CHILD_FRAME_ID": "invalid",
+    "TF_NO_FRAME_ID": "invalid",
+    "TF_NAN_INPUT": "invalid",
+    "TF_DENORMALIZED_QUATERNION": "invalid",
+}
+"""The names in tfbus of tf2's answers; those without a counterpart have none."""
 
 
 @dataclass(frozen=True)
@@ -70,26 +92,6 @@ def latest(target: str, source: str) -> Step:
     return {"latest": [target, source]}
 
 
-def chain(target: str, source: str, at: Stamp = LATEST) -> Step:
-    """The frames between two frames."""
-    return {"chain": [target, source, at]}
-
-
-def parent(frame: str) -> Step:
-    """The frame that another one hangs on by its newest sample."""
-    return {"parent": [frame]}
-
-
-def known(frame: str) -> Step:
-    """Whether a frame exists."""
-    return {"known": [frame]}
-
-
-def frames() -> Step:
-    """All names, sorted."""
-    return {"frames": []}
-
-
 def clear() -> Step:
     """Drop what moves."""
     return {"clear": []}
@@ -100,16 +102,50 @@ def bag(name: str, shift: int) -> Step:
     return {"bag": [name, shift]}
 
 
-def deviates(step: Step, deviation: str, tfbus: Any) -> Step:
-    """The same step, where tfbus gives another answer on purpose."""
-    return {**step, "deviation": deviation, "tfbus": tfbus}
-
-
-def placed(stamp: int, translation: Numbers | float = 0.0, rotation: Numbers = UPRIGHT) -> list[Any]:
-    """The answer of a lookup: a stamp and a transform."""
-    return [stamp, _vector(translation), list(rotation)]
-
-
 def verb_of(step: Step) -> str:
     """The kind of a step."""
     return next(iter(step))
+
+
+# The files of recordings
+
+
+def scenarios_in(path: Path) -> list[Scenario]:
+    """The scenarios of a recording, without the answers: to be asked again."""
+    recorded = ("tf2", "expected_by", "reason")
+    return [
+        Scenario(
+            scenario["scenario"],
+            [{key: value for key, value in step.items() if key not in recorded} for step in scenario["steps"]],
+            scenario["keep"],
+        )
+        for scenario in read(path)
+    ]
+
+
+def read(path: Path) -> list[Step]:
+    """The recorded scenarios of one theme."""
+    scenarios: list[Step] = json.loads(path.read_text(encoding="utf-8"))
+    return scenarios
+
+
+def as_text(scenarios: list[Step]) -> str:
+    """The content of the file of one theme."""
+    return "[\n" + ",\n".join(map(_scenario, scenarios)) + "\n]\n"
+
+
+def _scenario(scenario: Step) -> str:
+    steps = ",\n".join(
+        json.dumps(_short(step), ensure_ascii=False, separators=(",", ":")) for step in scenario["steps"]
+    )
+    head = f'"scenario": {json.dumps(scenario["scenario"], ensure_ascii=False)}, "keep": {scenario["keep"]}'
+    return f'{{{head}, "steps": [\n{steps}\n]}}'
+
+
+def _short(value: Any) -> Any:
+    """The same with 1 for 1.0."""
+    if isinstance(value, dict):
+        return {key: _short(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_short(part) for part in value]
+    return int(value) if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 else value

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import bags
 import pytest
-import recording_files
 from deviations import DEVIATIONS
+from steps import FOLDER, read
 from tfbus_replay import disagreements
 
-PATHS = sorted(recording_files.FOLDER.glob("*.json"))
+PATHS = sorted(FOLDER.glob("*.json"))
 BAG_THEMES = {"pr2_tf", "turtlesim"}
-THEMES = {path.stem: recording_files.read(path) for path in PATHS}
+THEMES = {path.stem: read(path) for path in PATHS}
 
 
 @pytest.mark.parametrize("theme", THEMES)

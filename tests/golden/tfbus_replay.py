@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from bags import transforms_in
-from steps import LATEST, SECOND, Step, verb_of
-from translation import TRANSLATION
+from steps import LATEST, SECOND, TRANSLATION, Step, verb_of
 
 import tfbus
 from tfbus import InvalidTransformError, Latest, Outcome, Transform, TransformLookupError, TransformStamped

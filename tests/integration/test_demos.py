@@ -17,8 +17,7 @@ from urllib.parse import quote
 import anyio
 import httpx
 import pytest
-from support.processes import new_domain
-from support.programs import Program
+from support.processes import Program, new_domain
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
@@ -32,6 +31,23 @@ DEMOS = Path(__file__).parents[2] / "demos"
 
 def load(name: str) -> dict[str, Any]:
     return runpy.run_path(str(DEMOS / name))
+
+
+def output_of(demo: str, *arguments: str, quiet: bool = False) -> list[str]:
+    """The lines that a demo prints when it is run as a script."""
+    command = [sys.executable, str(DEMOS / demo), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "" or not quiet
+    return done.stdout.splitlines()
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("demo", "lines"), [("future_transform", 3), ("two_robots", 8), ("message_filter", 8), ("robot_arm", 5)]
+)
+def test_a_demo_that_is_tested_in_simulated_time_runs_as_a_script(demo: str, lines: int) -> None:
+    assert len(output_of(f"{demo}.py", quiet=True)) == lines
 
 
 @pytest.mark.anyio
@@ -70,21 +86,8 @@ async def test_a_detection_comes_out_80_ms_later_one_fails_at_once_and_one_times
 
 
 @pytest.mark.thorough
-def test_the_demo_of_future_transforms_runs_as_a_script() -> None:
-    done = subprocess.run(
-        [sys.executable, DEMOS / "future_transform.py"], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 0
-    assert len(done.stdout.splitlines()) == 3
-
-
-@pytest.mark.thorough
 def test_the_demo_of_a_drop_out_tells_how_far_off_each_answer_is() -> None:
-    done = subprocess.run(
-        [sys.executable, DEMOS / "drop_out.py"], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 0
-    held, straight, refused, nearest = done.stdout.splitlines()
+    held, straight, refused, nearest = output_of("drop_out.py")
     # The chord of the turn since the sample, on a circle of radius 2 m and with 4 s a turn.
     assert f"{4 * math.sin(math.pi / 4 * 0.2):.2f} m off (extrapolated by 0.20 s, gap 0.00 s)" in held
     assert f"{2 - 2 * math.cos(math.pi / 4):.2f} m off (extrapolated by 0.00 s, gap 1.00 s)" in straight
@@ -114,22 +117,9 @@ async def test_one_robot_sees_the_gripper_of_another_with_the_same_frames(capsys
 
 
 @pytest.mark.thorough
-def test_the_demo_of_two_robots_runs_as_a_script() -> None:
-    done = subprocess.run(
-        [sys.executable, DEMOS / "two_robots.py"], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 0
-    assert len(done.stdout.splitlines()) == 8
-
-
-@pytest.mark.thorough
 def test_the_demo_of_a_fleet_shows_what_each_view_brings() -> None:
     options = ["--robots", "12", "--frames", "3", "--rate", "10", "--processes", "2", "--seconds", "2"]
-    done = subprocess.run(
-        [sys.executable, DEMOS / "fleet.py", *options], capture_output=True, text=True, timeout=120, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    heading, _, nobody, in_full, slowly, last = done.stdout.splitlines()
+    heading, _, nobody, in_full, slowly, last = output_of("fleet.py", *options, quiet=True)
     assert heading.startswith("12 robots x 3 frames x 10 Hz in 2 processes, ")
     peers = [int(re.split("  +", line)[1]) for line in (nobody, in_full, slowly)]
     assert peers == [0, 10, 12]
@@ -142,9 +132,7 @@ def test_the_demo_of_a_fleet_shows_what_each_view_brings() -> None:
 
 @pytest.mark.thorough
 def test_the_demo_of_a_watch_redraws_no_more_than_can_be_seen() -> None:
-    done = subprocess.run([sys.executable, DEMOS / "watch.py"], capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0
-    *redrawn, summary = done.stdout.splitlines()
+    *redrawn, summary = output_of("watch.py")
     numbers = [re.findall(r"\d+\.\d+", line) for line in redrawn]
     # In a hurry ten times a second, with the sample of the turn before; then whenever 0.1 m is full at 2.4 mm a sample.
     hurried = [(0.0, 0.0), *((k / 10, 1.5 * (k / 10 - 0.01)) for k in range(1, 11))]
@@ -170,15 +158,6 @@ async def test_the_demo_of_a_message_filter_places_five_detections_and_tells_of_
     assert old.startswith("dropped, too old: frame 'camera': asked for -59.300 s, oldest sample is -0.080 s")
     assert unknown.endswith("frame 'arm_camera' is not known, did you mean 'camera'?")
     assert lines[-1] == "7 detections, 5 placed, dropped: {'too old': 1, 'unknown frame': 1}"
-
-
-@pytest.mark.thorough
-def test_the_demo_of_a_message_filter_runs_as_a_script() -> None:
-    done = subprocess.run(
-        [sys.executable, DEMOS / "message_filter.py"], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.splitlines()[-1].startswith("7 detections")
 
 
 @pytest.mark.anyio
@@ -211,15 +190,6 @@ def arm_sees(seconds: float) -> tuple[float, float, float]:
 
 
 @pytest.mark.thorough
-def test_the_demo_of_the_arm_runs_as_a_script() -> None:
-    done = subprocess.run(
-        [sys.executable, DEMOS / "robot_arm.py"], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert len(done.stdout.splitlines()) == 5
-
-
-@pytest.mark.thorough
 def test_the_tutorials_two_programs_find_each_other_in_either_order_and_one_goes_on_without_the_other() -> None:
     domain = new_domain()
     info = (
@@ -247,28 +217,13 @@ def test_the_demo_of_a_recording_finds_the_camera_where_it_was_and_keeps_the_fil
         camera = (2 + 0.3j) * cmath.exp(2j * math.pi * second / 8)
         expected.append(f"({camera.real:.3f}, {camera.imag:.3f}, 0.500) at {second}.00 s")
     for arguments in ([], [str(path)]):
-        done = subprocess.run(
-            [sys.executable, DEMOS / "record_and_replay.py", *arguments],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-        assert (done.returncode, done.stderr) == (0, "")
-        assert done.stdout.splitlines() == [
+        assert output_of("record_and_replay.py", *arguments, quiet=True) == [
             # 50 a second for 8 s with both ends, and the camera's place.
             "recorded: 402 samples",
             *(f"the camera was at {place}" for place in expected),
             f"and once more at {expected[-1]}",
         ]
     assert path.stat().st_size > 0
-
-
-def output_of(demo: str) -> list[str]:
-    """The lines that a demo prints when it is run as a script."""
-    done = subprocess.run([sys.executable, DEMOS / demo], capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
 
 
 @pytest.mark.thorough

@@ -35,11 +35,7 @@ def test_the_examples_and_the_whole_are_as_short_as_promised() -> None:
 def test_every_name_that_the_table_for_tf2_users_mentions_exists() -> None:
     table = TF2.partition("## Names")[2].partition("## ")[0]
     ours = "".join(line.split("|")[2] for line in table.splitlines() if line.count("|") == 3)
-    owners = {
-        "buffer": tfbus.Buffer,
-        "tree": tfbus.TransformTree,
-        "broadcaster": tfbus.TransformBroadcaster,
-    }
+    owners = {"buffer": tfbus.Buffer, "tree": tfbus.TransformTree, "broadcaster": tfbus.TransformBroadcaster}
     methods = re.findall(r"\b(buffer|tree|broadcaster)\.(\w+)", ours)
     assert methods
     for owner, method in methods:

@@ -17,9 +17,18 @@ from typing import Any
 
 import anyio
 import pytest
-from support.both_sides import SECONDS, Node, Program, meet, node
+from support.both_sides import (
+    SECONDS,
+    URDF,
+    Node,
+    Program,
+    check_clock,
+    check_command,
+    check_description_and_joints,
+    meet,
+    node,
+)
 from support.processes import free_ports, until
-from support.robot_of_ros import URDF, check_clock, check_command, check_description_and_joints
 from support.samples import static
 from support.wires import latched
 

@@ -15,8 +15,7 @@ pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
 pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
 
-from support.processes import new_domain, until
-from support.programs import free_address
+from support.processes import free_address, new_domain, until
 from support.rosbridge import rosbridge_server
 from support.samples import moving, static
 from support.wires import latched

@@ -78,18 +78,8 @@ def run(folder: Path, **files: str) -> list[str]:
         (folder / f"{name}.py").write_text(text, encoding="utf-8")
     settings = f"[pytest]\npythonpath = {str(TESTS)!r}\nmarkers =\n  thorough\n  every_loop\n"
     (folder / "pytest.ini").write_text(settings, encoding="utf-8")
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-n0",
-        "-rA",
-        "--tb=short",
-        "-p",
-        "no:cacheprovider",
-        "-m",
-        "not thorough",
-    ]
+    options = ["-n0", "-rA", "--tb=short", "-p", "no:cacheprovider", "-m", "not thorough"]
+    command = [sys.executable, "-m", "pytest", *options]
     done = subprocess.run([*command, str(folder)], cwd=folder, capture_output=True, text=True, timeout=60, check=False)
     return done.stdout.splitlines()
 

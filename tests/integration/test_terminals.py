@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 from support import pr2
-from support.processes import new_domain
-from support.programs import free_address, start_tfbus
+from support.processes import free_address, new_domain, start_tfbus
 from support.recorded import SMALL
 from support.terminal import lines_on_a_terminal
 

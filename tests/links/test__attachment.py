@@ -5,7 +5,7 @@ from itertools import islice
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from support.allocations import peak_of
+from support.processes import peak_of
 from support.strategies import CHARACTERS
 
 from tfbus.links._attachment import (

@@ -4,9 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from support.foreign import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
 from support.samples import moving, static
-from support.wires import Domain, WireCarrier, latched
+from support.wires import Domain, ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld, WireCarrier, latched
 
 from tfbus import Bus, SimulatedClock, TransformStamped
 from tfbus.links._carrier import Carrier, SendReport

@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 from support import wires
-from support.foreign import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
 from support.samples import moving, static
-from support.wires import Domain
+from support.wires import Domain, ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
 
 from tfbus import Bus, Event, SimulatedClock
 from tfbus.events import PeerJoined, PeerLost, PeerRejected

@@ -6,7 +6,6 @@ from functools import partial
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.link_model import Model, Step, frames_of, steps_of
 from support.samples import moving, static
 from support.wires import (
     CHAIN,
@@ -20,9 +19,13 @@ from support.wires import (
     TWO_BRIDGES,
     Domain,
     Graph,
+    Model,
     Network,
+    Step,
+    frames_of,
     latched,
     size_of,
+    steps_of,
 )
 
 from tfbus import Bus, BusClosedError, PeerLost, SimulatedClock, TransformStamped

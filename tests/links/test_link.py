@@ -9,10 +9,9 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
-from support.foreign import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
 from support.processes import until
 from support.samples import moving, static
-from support.wires import WireCarrier
+from support.wires import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld, WireCarrier
 
 from tfbus import Bus, BusClosedError, PeerJoined, PeerLost, PeerRejected, SimulatedClock
 from tfbus.links import Link, _endpoint

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.allocations import peak_of
+from support.processes import peak_of
 
 from tfbus import SECOND
 from tfbus.recording.summary import _SINGLE, Durations

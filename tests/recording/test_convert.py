@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
-from support.open_files import is_open
+from support.processes import is_open
 from support.recorded import SMALL, Line, batches_in, messages_in, sender_of, write_mcap
 from support.samples import moving, static
 

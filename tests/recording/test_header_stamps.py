@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 import zstandard
 from rosbags.typesys import Stores, get_typestore
-from support.open_files import is_open
+from support.processes import is_open
 from support.recorded import Line, real, write_mcap
 
 from tfbus import RecordingError

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from support.joint_messages import KIND, joint_state
-from support.open_files import is_open
+from support.processes import is_open
 from support.recorded import real, write_mcap
 
 from tfbus import Joint, RecordingError, RobotModel, Transform, TransformStamped

@@ -13,7 +13,7 @@ import pytest
 from mcap.writer import Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
-from support.open_files import OPEN_FILES, is_open
+from support.processes import OPEN_FILES, is_open
 from support.recorded import SMALL, as_ros2, messages_in, without_unfinished, write_mcap
 from support.samples import moving, static
 

@@ -54,10 +54,7 @@ def finished_file(kind: str, folder: Path) -> Path:
     return zstd(copy) if kind.endswith("zstd") else copy
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [*OPTIONS, "bag", "db3", "mcap.zstd", "db3.zstd"],
-)
+@pytest.mark.parametrize("kind", [*OPTIONS, "bag", "db3", "mcap.zstd", "db3.zstd"])
 @pytest.mark.parametrize("step", [97, pytest.param(1, marks=pytest.mark.thorough)])
 def test_a_finished_file_that_is_cut_anywhere_tells_of_it(tmp_path: Path, kind: str, step: int) -> None:
     path = finished_file(kind, tmp_path)

@@ -5,9 +5,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 
 import pytest
-from support.foreign import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
 from support.samples import moving
-from support.wires import Domain, latched
+from support.wires import Domain, ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld, latched
 
 from tfbus import Bus, SimulatedClock, TransformStamped
 from tfbus.links._carrier import SendReport

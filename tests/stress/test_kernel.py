@@ -13,13 +13,11 @@ import anyio
 import anyio.lowlevel
 import numpy as np
 import pytest
+from support.asking import threads_that
 from support.both_kernels import COMPILED, bits, needs_both, sample_class
-from support.samples import moving, over, static, tree_of
-from support.threads import threads_that
+from support.samples import moving, over, static
 
-import tfbus
 from tfbus import LATEST, Buffer, Bus, TransformLookupError, TransformTree
-from tfbus.which_kernel import History
 
 pytestmark = pytest.mark.thorough
 
@@ -346,9 +344,3 @@ else:
         interpreters.run_string(number, script.replace("PLACE", repr(COMPILED.__file__)))
     finally:
         interpreters.destroy(number)
-
-
-def test_a_tree_of_this_process_uses_the_kernel() -> None:
-    tree = tree_of(moving("a", "b", 1))
-    assert isinstance(tree._forest.frames["b"], History)
-    assert tfbus.kernel in ("compiled", "python")

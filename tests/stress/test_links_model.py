@@ -3,7 +3,6 @@
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.link_model import Model, Step, frames_of, steps_of
 from support.wires import (
     CHAIN,
     CIRCLE,
@@ -14,8 +13,12 @@ from support.wires import (
     TRIANGLE,
     TWO_BRIDGES,
     Graph,
+    Model,
     Network,
+    Step,
+    frames_of,
     latched,
+    steps_of,
 )
 
 from tfbus import Buffer, Bus, SimulatedClock
@@ -52,10 +55,7 @@ def test_without_loss_every_bus_receives_every_batch_once_whole_and_in_order(gra
         assert latched(late) == latched(net.buses[0])
 
 
-@given(
-    graph=LOSSY,
-    steps=steps_of("overtake", "overtake", "drop", "repeat", "join"),
-)
+@given(graph=LOSSY, steps=steps_of("overtake", "overtake", "drop", "repeat", "join"))
 @settings(suppress_health_check=[HealthCheck.too_slow])
 def test_with_loss_nothing_older_comes_and_in_the_end_all_agree_on_what_is_static(
     graph: Graph, steps: list[Step]
@@ -73,11 +73,7 @@ def test_with_loss_nothing_older_comes_and_in_the_end_all_agree_on_what_is_stati
         model.check_all_agree()
 
 
-@given(
-    graph=LOSSY,
-    steps=steps_of("part", "part", "meet"),
-    drop_lost=st.booleans(),
-)
+@given(graph=LOSSY, steps=steps_of("part", "part", "meet"), drop_lost=st.booleans())
 @settings(suppress_health_check=[HealthCheck.too_slow])
 def test_when_peers_are_lost_and_found_all_agree_in_the_end_whether_their_frames_leave_or_not(
     graph: Graph, steps: list[Step], drop_lost: bool
@@ -121,12 +117,7 @@ def test_links_that_hear_only_some_frames_hold_exactly_these_in_the_end(
             assert leaf.statistics().rejected == {}
 
 
-@given(
-    graph=LOSSY,
-    steps=steps_of(),
-    more=steps_of(),
-    which=st.integers(0, 3),
-)
+@given(graph=LOSSY, steps=steps_of(), more=steps_of(), which=st.integers(0, 3))
 @settings(suppress_health_check=[HealthCheck.too_slow])
 def test_the_frames_of_a_dead_bus_leave_everywhere_whatever_is_on_its_way(
     graph: Graph, steps: list[Step], more: list[Step], which: int

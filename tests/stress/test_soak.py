@@ -8,8 +8,7 @@ import anyio
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from support.askers import ask, filter_messages, watch
-from support.crowd import FRAMES, Crowd, Ending
+from support.crowd import FRAMES, Crowd, Ending, ask, filter_messages, watch
 
 from tfbus import (
     AheadError,

@@ -13,8 +13,7 @@ import anyio
 import anyio.to_thread
 import pytest
 import zenoh
-from support.processes import PATIENCE, new_domain, until
-from support.programs import free_address
+from support.processes import PATIENCE, free_address, new_domain, until
 from support.samples import moving, static
 
 from tfbus import LATEST, Buffer, Bus, RemoteLookupError, SimulatedClock
@@ -191,12 +190,7 @@ async def test_whatever_a_stranger_sends_by_any_key_all_are_served_and_the_rest_
         "hears": f"tfbus/{domain}/~/@alive/{STRANGER}/0".encode(),
         "lookup": write_question(RemoteQuestion("s", 1, "map", "base", LATEST, 1.0, 2.0, 3, "map", 0.1, 0.2, 0.3)),
     }
-    with (
-        Bus(max_ahead=None) as bus,
-        Bus(clock, max_ahead=None) as other,
-        Buffer(bus) as buffer,
-        Buffer(other),
-    ):
+    with Bus(max_ahead=None) as bus, Bus(clock, max_ahead=None) as other, Buffer(bus) as buffer, Buffer(other):
         async with (
             ZenohLink(bus, domain, listen=address, history=5.0) as link,
             ZenohLink(other, domain, connect=address, history=5.0, clock=clock, frames=["arm", "base", "lamp"]) as peer,

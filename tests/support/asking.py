@@ -1,6 +1,10 @@
-"""A moving child, a pause, and a call in a task of its own, for the tests of the bus."""
+"""A moving child, a pause, a call in a task of its own, and threads that read while the test writes."""
 
-from collections.abc import Awaitable, Callable
+import sys
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Generic, TypeVar
 
 import anyio
@@ -69,3 +73,32 @@ class Asked(Generic[T]):
         except Exception as error:  # noqa: BLE001 - the test looks at it
             self.error = error
         self.ended = True
+
+
+# Threads that read while the test writes
+
+
+@contextmanager
+def threads_that(read: Callable[[], None], number: int = 2) -> Iterator[None]:
+    """Some threads call `read` over and over while the block runs, and take turns as often as they can."""
+    begun, done = threading.Barrier(number + 1), threading.Event()
+
+    def go_on() -> None:
+        begun.wait()
+        while not done.is_set():
+            read()
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(number) as pool:
+            readers = [pool.submit(go_on) for _ in range(number)]
+            begun.wait()
+            try:
+                yield
+            finally:
+                done.set()
+        for reader in readers:
+            reader.result()
+    finally:
+        sys.setswitchinterval(interval)

@@ -20,10 +20,7 @@ except ImportError:
 
 needs_both = pytest.mark.skipif(COMPILED is None, reason="the compiled kernel was not built")
 
-KERNELS = [
-    pytest.param(_python_kernel, id="python"),
-    pytest.param(COMPILED, id="compiled", marks=needs_both),
-]
+KERNELS = [pytest.param(_python_kernel, id="python"), pytest.param(COMPILED, id="compiled", marks=needs_both)]
 """The modules with `History`, `Chain`, `Paths` and `commit`."""
 
 

@@ -4,29 +4,34 @@ Every actor does one kind of thing, with random numbers and at moments of its ow
 tells nearly the same story again.
 """
 
+import math
 import threading
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from random import Random
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import anyio
 from anyio.abc import TaskGroup
 from support.asking import Asked
-from support.ledger import Ledger
 
 from tfbus import (
+    LATEST,
     SECOND,
     Buffer,
     Bus,
     BusClosedError,
+    ClockResetError,
     Event,
     EventStream,
+    Hold,
     InvalidTransformError,
     MessageFilter,
+    PointStamped,
     SimulatedClock,
+    Stream,
     Transform,
     TransformBroadcaster,
     TransformStamped,
@@ -311,3 +316,210 @@ class Crowd:
         async for event in events:
             self.told[events].append(event)
             await self.pause(rng, longest)
+
+
+# Those who ask a crowd's buffers: lookups, watches and message filters, at random and cut short at random
+
+
+class SourceError(Exception):
+    """The error that a source of messages raises."""
+
+
+class Message(NamedTuple):
+    number: int
+    frame: str
+    stamp: int
+
+
+def policy(rng: Random) -> dict[str, Any]:
+    kind = rng.choice(("none", "none", "tolerance", "max_gap", "extrapolate"))
+    seconds = rng.uniform(0.0, 0.4)
+    return {} if kind == "none" else {kind: Hold(seconds) if kind == "extrapolate" else seconds}
+
+
+def longest_hold(rng: Random) -> float:
+    """In s; now and then there is no end to it."""
+    return math.inf if rng.random() < 0.1 else rng.uniform(0.0, 4.0)
+
+
+async def look_up(crowd: Crowd, rng: Random) -> None:
+    buffer = rng.choice(crowd.buffers)
+    target, source, fixed = rng.sample(FRAMES, 3)
+    if rng.random() < 0.02:
+        target = "/" + target
+    at, source_at = (crowd.clock.now() + from_seconds(rng.uniform(-2.0, 0.5)) for _ in range(2))
+    options = {**policy(rng), "timeout": rng.choice((None, 0.0, 0.2, 2.0))}
+    kind = rng.choice(("at", "at", "latest", "travel", "data", "data travel"))
+    if kind in ("data", "data travel"):
+        point = PointStamped(source, rng.choice((source_at, LATEST)), (1.0, 0.0, 0.0))
+        if kind == "data travel":
+            options |= {"at": at, "fixed": fixed}
+        moved = await buffer.transform(point, target, **options)
+        assert moved.frame == target
+        return
+    if kind == "latest":
+        found = await buffer.lookup(target, source, max_age=rng.choice((None, 0.2)), **options)
+    else:
+        if kind == "travel":
+            options |= {"source_at": source_at, "fixed": fixed}
+        found = await buffer.lookup(target, source, at, **options)
+        assert found.stamp == at
+    assert (found.parent, found.child) == (target, source)
+
+
+async def ask(crowd: Crowd, rng: Random) -> None:
+    async with anyio.create_task_group() as tasks:
+        while crowd.going:
+            crowd.asked.append(Asked(tasks, partial(look_up, crowd, Random(rng.random()))))
+            if rng.random() < 0.3:
+                rng.choice(crowd.asked[-20:]).cancel()
+            await crowd.pause(rng, 0.15)
+
+
+async def watch(crowd: Crowd, rng: Random) -> None:
+    while crowd.going:
+        target, source = rng.sample(FRAMES, 2)
+        options = {**policy(rng), "max_age": rng.choice((None, 0.5)), "max_rate": rng.choice((None, 5.0))}
+        changes = rng.choice(crowd.buffers).watch(target, source, min_translation=rng.choice((0.0, 0.1)), **options)
+        with changes, crowd.clock.move_on_after(longest_hold(rng)):
+            for _ in range(3):
+                try:
+                    async for found in changes:
+                        assert (found.parent, found.child) == (target, source)
+                        crowd.met["watched"] += 1
+                        await crowd.pause(rng, 0.4)
+                except ClockResetError:
+                    crowd.met["watch reset"] += 1
+        await crowd.pause(rng, 0.2)
+
+
+async def messages(crowd: Crowd, rng: Random, sent: list[Message]) -> AsyncIterator[Message]:
+    while True:
+        await crowd.pause(rng, 0.1)
+        if rng.random() < 0.03:
+            raise SourceError
+        stamp = crowd.clock.now() + from_seconds(rng.uniform(-2.0, 0.5))
+        sent.append(Message(len(sent), rng.choice((*FRAMES, "nobody", "/bad")), stamp))
+        yield sent[-1]
+
+
+async def filter_messages(crowd: Crowd, rng: Random) -> None:
+    sent: list[Message] = []
+    ended: list[Message] = []
+
+    def drop(message: Message, reason: str, error: Exception | None) -> None:
+        assert reason == "queue full" or error is not None or reason == "closed"
+        ended.append(message)
+
+    while crowd.going:
+        await crowd.pause(rng, 0.2)
+        targets: Any = rng.choice(("map", ("map", "base")))
+        pairs: MessageFilter[Message, Any] = MessageFilter(
+            messages(crowd, rng, sent),
+            rng.choice(crowd.buffers),
+            targets,
+            tolerance=rng.choice((0.0, 0.1)),
+            timeout=rng.choice((None, 0.0, 0.2, 1.0)),
+            capacity=rng.randint(1, 6),
+            overflow=rng.choice(("drop_oldest", "drop_newest", "block")),
+            order=rng.choice(("ready", "stamp", "arrival")),
+            on_drop=drop,
+        )
+        crowd.filters.append(pairs)
+        try:
+            with crowd.clock.move_on_after(longest_hold(rng)):
+                async with pairs:
+                    async for message, _ in pairs:
+                        ended.append(message)
+                        if rng.random() < 0.1:
+                            pairs.set_target("odom" if targets == "map" else ("odom", "map"))
+                        await crowd.pause(rng, 0.3)
+        except SourceError:
+            crowd.met["source failed"] += 1
+        finally:
+            assert sorted(ended) == sent
+            assert pairs.arrived == pairs.delivered + sum(pairs.dropped.values())
+            crowd.met.update(pairs.dropped)
+            crowd.met["delivered"] += pairs.delivered
+            sent.clear()
+            ended.clear()
+
+
+# The samples that a stream was offered, and the fate of each
+
+
+class Ledger:
+    """The samples that a stream was offered while it was open, and the fate of each moving one.
+
+    What a conflating stream gives up for something newer of the same child is `superseded` here, and `pending` is what
+    such a stream must hold.
+    """
+
+    def __init__(self, stream: Stream) -> None:
+        self.stream = stream
+        self.conflates = stream.queue.overflow == "conflate"
+        self.open = True
+        self.offered = self.read = self.lost = self.superseded = 0
+        self.pending: dict[str, TransformStamped] = {}
+        self.statics: dict[str, TransformStamped] = {}
+        self.statics_read: dict[str, TransformStamped] = {}
+
+    def offer(self, batch: Batch) -> None:
+        for sample in batch:
+            if sample.static:
+                self.statics[sample.child] = sample
+            else:
+                self.offered += 1
+            if self.conflates:
+                self._conflate(sample)
+        while len(self.pending) > self.stream.queue.capacity:
+            self._lose(next(iter(self.pending)))
+
+    def forget(self, child: str) -> None:
+        self.statics.pop(child, None)
+        self._lose(child)
+
+    def discard_moving(self) -> None:
+        for child in tuple(self.pending):
+            self._lose(child)
+
+    def note(self, batch: Batch) -> None:
+        moving = [sample for sample in batch if not sample.static]
+        self.read += len(moving)
+        self.statics_read.update((sample.child, sample) for sample in batch if sample.static)
+        if self.conflates:
+            assert [id(sample) for sample in moving] == [id(sample) for sample in self.pending.values()]
+            self.pending.clear()
+
+    def check(self) -> None:
+        left = self.offered - self.read - self.stream.dropped - self.stream.queue.conflated
+        assert 0 <= left <= len(self.stream.queue)
+        if self.conflates:
+            assert (left, self.stream.dropped) == (len(self.pending), self.lost)
+        assert self.stream.queue.conflated == self.superseded
+
+    async def check_to_the_end(self) -> None:
+        """Read what the reader has left behind when it went."""
+        async for batch in self.stream:
+            self.note(batch)
+        self.check()
+        assert self.offered == self.read + self.stream.dropped + self.superseded
+        for child, sample in self.statics.items():
+            assert self.statics_read.get(child) is sample, "the newest static sample is never dropped"
+
+    def close(self) -> None:
+        self.open = False
+        self.stream.close()
+
+    def _conflate(self, sample: TransformStamped) -> None:
+        before = self.pending.get(sample.child)
+        self.superseded += before is not None
+        if not sample.static:
+            self.statics.pop(sample.child, None)
+        if sample.static or before is None or before.stamp <= sample.stamp:
+            self.pending.pop(sample.child, None)
+            if not sample.static:
+                self.pending[sample.child] = sample
+
+    def _lose(self, child: str) -> None:
+        self.lost += self.pending.pop(child, None) is not None

@@ -18,8 +18,7 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
-from ros_chain import Chain  # type: ignore[import-not-found]
-from ros_driver import Driver  # type: ignore[import-not-found]
+from ros_driver import Chain, Driver  # type: ignore[import-not-found]
 
 
 @dataclass

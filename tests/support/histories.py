@@ -1,11 +1,14 @@
-"""Histories of single frames, for the tests of the modules below the forest."""
+"""Histories of single frames, and live trees without a bus, for the tests of the modules below the buffer."""
 
 from collections.abc import Iterable
 
 import tfbus
-from tfbus import Transform
+from tfbus import Transform, TransformTree
 from tfbus.rows import Row
+from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
+from tfbus.tree.tree import tree_of, window_of
+from tfbus.waiting.live_tree import LiveTree
 
 
 def at_x(x: float) -> Transform:
@@ -38,3 +41,16 @@ def static_edge(parent: str, child: str, transform: Transform, stamp: int = 0) -
     edge = FrameHistory(child, parent, static=True, keep=None)
     edge.insert_static(parent, stamp, row_of(transform), "")
     return edge
+
+
+# Live trees without a bus
+
+
+def live_tree(keep: float | None) -> LiveTree:
+    """A live tree that the test fills; `keep` in s."""
+    return LiveTree(Forest(window_of(keep)))
+
+
+def tree_over(live: LiveTree) -> TransformTree:
+    """The tree of a buffer that has this live tree."""
+    return tree_of(live.forest, None)

@@ -9,8 +9,7 @@ import os
 import time
 from typing import Any
 
-from ros_chain import Chain  # type: ignore[import-not-found]
-from ros_driver import Driver  # type: ignore[import-not-found]
+from ros_driver import Chain, Driver  # type: ignore[import-not-found]
 from rosbags.typesys import Stores, get_typestore
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile

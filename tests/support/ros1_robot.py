@@ -1,13 +1,13 @@
 """A robot of ROS 1, for `tests/links/rosbridge/test_ros1.py`: run by a Python that has rospy, with a file of URDF.
 
-It latches ``/robot_description``, and does what `ros_robot.py` says on ``/joint_states`` and ``/clock``.
+It latches ``/robot_description``, and does what `ros_driver.py` says on ``/joint_states`` and ``/clock``.
 """
 
 import sys
 from pathlib import Path
 
 import rospy  # type: ignore[import-not-found]
-from ros_robot import JOINTS, play  # type: ignore[import-not-found]
+from ros_driver import JOINTS, play  # type: ignore[import-not-found]
 from rosgraph_msgs.msg import Clock  # type: ignore[import-not-found]
 from sensor_msgs.msg import JointState  # type: ignore[import-not-found]
 from std_msgs.msg import String  # type: ignore[import-not-found]

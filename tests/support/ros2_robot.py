@@ -1,6 +1,6 @@
 """A robot of ROS 2, for `tests/integration/test_ros2.py`: run by a Python that has rclpy, with a file of URDF.
 
-It publishes ``/robot_description``, transient local, and does what `ros_robot.py` says on ``/joint_states`` and
+It publishes ``/robot_description``, transient local, and does what `ros_driver.py` says on ``/joint_states`` and
 ``/clock``.
 """
 
@@ -11,7 +11,7 @@ import rclpy
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
-from ros_robot import JOINTS, play  # type: ignore[import-not-found]
+from ros_driver import JOINTS, play  # type: ignore[import-not-found]
 from rosgraph_msgs.msg import Clock  # type: ignore[import-not-found]
 from sensor_msgs.msg import JointState  # type: ignore[import-not-found]
 from std_msgs.msg import String  # type: ignore[import-not-found]

@@ -6,9 +6,12 @@ other side. So many seconds after the first answer, when the two have met, it en
 
 import argparse
 import json
+import math
 import time
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
+from threading import Lock
 
 RATE = 100
 MEETING_TIME = 60.0
@@ -68,3 +71,77 @@ class Driver:
         facts = {"sent": sent, "answered": answered, "failed": failed, "wrong": wrong, "received": self._received}
         median = sorted(self._latencies)[len(self._latencies) // 2] / 1e6 if self._latencies else None
         print(json.dumps({"event": "end", **facts, "latency_ms": median}), flush=True)
+
+
+# The transform of ``odom:tool`` for drivers that have no tf2, run by a Python that need not have tfbus
+
+KEPT = 1_000
+
+
+class Chain:
+    """Holds x of ``odom:base``, ``base:arm`` and ``arm:tool`` and adds them, as tf2 does; for any thread."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._moving: dict[str, list[tuple[int, float]]] = {"base": [], "arm": []}
+        self._tool: float | None = None
+
+    def take(self, parent: str, child: str, stamp: int, x: float, static: bool) -> None:
+        """Take a transform, with its stamp in ns."""
+        with self._lock:
+            if (parent, child, static) == ("arm", "tool", True):
+                self._tool = x
+            elif not static and (parent, child) in (("odom", "base"), ("base", "arm")):
+                samples = self._moving[child]
+                samples.append((stamp, x))
+                del samples[:-KEPT]
+
+    def ask(self) -> Answer | None:
+        """The newest transform that all three can answer; None if there is none."""
+        with self._lock:
+            if self._tool is None or not all(self._moving.values()):
+                return None
+            at = min(samples[-1][0] for samples in self._moving.values())
+            parts = [_between(samples, at) for samples in self._moving.values()]
+        return None if None in parts else (at, sum(filter(None, parts)) + self._tool)
+
+
+def _between(samples: list[tuple[int, float]], at: int) -> float | None:
+    after = bisect_right(samples, (at, float("inf")))
+    if not after:
+        return None
+    before, x = samples[after - 1]
+    if before == at or after == len(samples):
+        return x if before == at else None
+    stamp, further = samples[after]
+    return x + (further - x) * (at - before) / (stamp - before)
+
+
+# The half of a robot that is the same in ROS 1 and ROS 2, run by a Python that need not have tfbus
+
+JOINTS = ["shoulder", "elbow"]
+
+
+def play(move: Callable[[int, list[float]], None], tell: Callable[[float], None], is_heard: Callable[[], int]) -> None:
+    """Move the joints and tell the time for ever.
+
+    Parameters
+    ----------
+    move : callable
+        Publishes the positions of `JOINTS`, sin(t) and cos(t), with their stamp in ns.
+    tell : callable
+        Publishes the time in s. It begins at 100, and jumps back to 50 after somebody has listened to it for 1.5 s.
+    is_heard : callable
+        Whether somebody listens to the time: the number of those.
+    """
+    print("up", flush=True)
+    start, listened = time.monotonic(), 0.0
+    while True:
+        time.sleep(0.02)
+        stamp = time.time_ns()
+        move(stamp, [math.sin(stamp / 10**9), math.cos(stamp / 10**9)])
+        if is_heard() and not listened:
+            listened = time.monotonic()
+        ended = listened + 1.5 if listened else math.inf
+        now = time.monotonic()
+        tell(100 + now - start if now < ended else 50 + now - ended)

@@ -1,7 +1,7 @@
 """One of each type of stamped data, a transform that they can be moved by, and a way to compare arrays too."""
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -56,7 +56,7 @@ def name_of(data: Any) -> str:
 
 def contents(data: Any) -> dict[str, Any]:
     """All fields, in a form that compares by value and dtype, NaN included."""
-    return {field.name: _comparable(getattr(data, field.name)) for field in fields(data)}
+    return {part.name: _comparable(getattr(data, part.name)) for part in fields(data)}
 
 
 def _comparable(value: Any) -> Any:
@@ -69,7 +69,7 @@ def _comparable(value: Any) -> Any:
 
 def arrays_of(data: Any) -> list[np.ndarray[Any, Any]]:
     """Every array that `data` hold."""
-    values = [getattr(data, field.name) for field in fields(data)]
+    values = [getattr(data, part.name) for part in fields(data)]
     parts = [part for value in values for part in (value.values() if isinstance(value, Mapping) else [value])]
     return [part for part in parts if isinstance(part, np.ndarray)]
 
@@ -77,10 +77,40 @@ def arrays_of(data: Any) -> list[np.ndarray[Any, Any]]:
 def numbers(data: Any) -> np.ndarray[Any, Any]:
     """Every number that a transform can have changed, in one row."""
     row: list[Any] = []
-    for field in fields(data):
-        value = getattr(data, field.name)
+    for part in fields(data):
+        value = getattr(data, part.name)
         if isinstance(value, Transform):
             row += (*value.translation, *value.rotation)
         elif isinstance(value, (tuple, np.ndarray)):
             row += np.ravel(value).tolist()
     return np.array(row, np.float64)
+
+
+# Messages as rclpy has them: mutable, with their frame and stamp in a header
+
+
+@dataclass
+class Time:
+    sec: int = 0
+    nanosec: int = 0
+
+
+@dataclass
+class Header:
+    stamp: Time = field(default_factory=Time)
+    frame_id: str = ""
+
+
+@dataclass
+class Point:
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+
+@dataclass
+class PointMessage:
+    """As geometry_msgs/PointStamped is."""
+
+    header: Header = field(default_factory=Header)
+    point: Point = field(default_factory=Point)

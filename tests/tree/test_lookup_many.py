@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.asking import threads_that
 from support.samples import moving, over, static, tree_of
 from support.strategies import TODAY, small_angles, transforms, unit_vectors
-from support.threads import threads_that
 
 import tfbus
 from tfbus import (

@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.asking import threads_that
 from support.samples import any_samples, moving, over, static, tree_of, x_of
 from support.strategies import TODAY
-from support.threads import threads_that
 
 from tfbus import (
     LATEST,

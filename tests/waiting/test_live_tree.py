@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.live_trees import live_tree, tree_over
+from support.histories import live_tree, tree_over
 from support.samples import any_samples, moving, static
 
 from tfbus import (

@@ -2,7 +2,7 @@ from itertools import permutations
 
 from hypothesis import given
 from hypothesis import strategies as st
-from support.live_trees import live_tree, tree_over
+from support.histories import live_tree, tree_over
 from support.samples import any_samples, moving
 
 from tfbus import ClockResetError, InvalidTransformError, TransformLookupError, TransformStamped, TransformTree

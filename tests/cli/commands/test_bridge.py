@@ -5,8 +5,7 @@ import anyio
 import anyio.to_thread
 import pytest
 from support.commands import Command, check_wrong_call
-from support.processes import new_domain, until
-from support.programs import free_address, start_tfbus
+from support.processes import free_address, new_domain, start_tfbus, until
 from support.samples import moving, static
 from support.wires import latched
 

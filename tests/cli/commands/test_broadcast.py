@@ -2,8 +2,7 @@ import signal
 
 import pytest
 from support.commands import START, Command
-from support.processes import new_domain
-from support.programs import start_tfbus
+from support.processes import new_domain, start_tfbus
 
 from tfbus import SECOND, Bus, Transform, TransformStamped
 

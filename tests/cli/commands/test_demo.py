@@ -3,7 +3,7 @@ import signal
 
 import pytest
 from support.commands import Command
-from support.programs import start_tfbus
+from support.processes import start_tfbus
 
 BACKENDS = ["asyncio", "trio"]
 SIMULATED = "".join(

@@ -7,8 +7,7 @@ import anyio
 import anyio.to_thread
 import pytest
 from support.commands import Command, check_wrong_call
-from support.processes import new_domain
-from support.programs import PATIENCE, TFBUS, free_address, start_tfbus
+from support.processes import PATIENCE, TFBUS, free_address, new_domain, start_tfbus
 from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, Transform, TransformStamped, from_seconds

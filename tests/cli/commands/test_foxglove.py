@@ -6,8 +6,7 @@ import pytest
 pytest.importorskip("foxglove", reason="serving Foxglove needs foxglove-sdk")
 
 from support.commands import Command, check_wrong_call
-from support.processes import new_domain
-from support.programs import free_address, start_tfbus
+from support.processes import free_address, new_domain, start_tfbus
 
 from tfbus import Bus
 

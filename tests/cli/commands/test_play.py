@@ -11,8 +11,7 @@ from pathlib import Path
 import anyio
 import pytest
 from support.commands import Command, Done, check_wrong_call, nobody
-from support.processes import new_domain
-from support.programs import free_address, start_tfbus
+from support.processes import free_address, new_domain, start_tfbus
 from support.recorded import SMALL, WRONG_IN_SMALL, messages_in, write_mcap
 from support.samples import moving, static
 from support.terminal import Terminal, on_a_terminal

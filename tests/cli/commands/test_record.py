@@ -8,8 +8,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from support.commands import Command, check_wrong_call, nobody
-from support.processes import new_domain
-from support.programs import TFBUS, Program, free_address, start_tfbus
+from support.processes import TFBUS, Program, free_address, new_domain, start_tfbus
 from support.recorded import messages_in
 from support.samples import moving, static
 

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from support import pr2
 from support.commands import START, Command, check_wrong_call, nobody
-from support.processes import new_domain, until
-from support.programs import free_address, start_tfbus
+from support.processes import free_address, new_domain, start_tfbus, until
 
 from tfbus import SECOND, Buffer, Bus, RobotModel, TransformStamped
 from tfbus.cli.commands import robot

@@ -4,8 +4,7 @@ import socket
 
 import pytest
 from support.commands import Command, check_wrong_call
-from support.processes import new_domain
-from support.programs import free_address, start_tfbus
+from support.processes import free_address, new_domain, start_tfbus
 
 
 @pytest.mark.thorough

@@ -6,8 +6,7 @@ from pathlib import Path
 import anyio.lowlevel
 import pytest
 from support.commands import START, Command, check_wrong_call
-from support.processes import new_domain
-from support.programs import start_tfbus
+from support.processes import new_domain, start_tfbus
 
 from tfbus import Bus, Transform, TransformStamped
 

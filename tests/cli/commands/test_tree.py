@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 from support.commands import START, Command, check_wrong_call
-from support.processes import new_domain
-from support.programs import PATIENCE, TFBUS, free_address, start_tfbus
+from support.processes import PATIENCE, TFBUS, free_address, new_domain, start_tfbus
 from support.samples import moving, static
 
 from tfbus import SECOND, Bus, Edge

@@ -9,8 +9,7 @@ import pytest
 pytest.importorskip("viser", reason="the live page needs viser")
 
 from support.commands import Command, check_wrong_call
-from support.processes import new_domain
-from support.programs import free_address, start_tfbus
+from support.processes import free_address, new_domain, start_tfbus
 from support.recorded import SMALL, write_mcap
 from support.samples import moving
 

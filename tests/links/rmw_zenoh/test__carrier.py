@@ -5,8 +5,7 @@ from typing import Any
 import anyio
 import pytest
 import zenoh
-from support.processes import until
-from support.programs import free_address
+from support.processes import free_address, until
 from support.samples import moving, static
 
 from tfbus.links._carrier import Carrier, SendReport

@@ -25,10 +25,9 @@ import pytest
 
 pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
 
-from support.both_sides import Program
+from support.both_sides import URDF, Program, check_clock, check_command, check_description_and_joints
 from support.processes import free_ports, until
-from support.robot_of_ros import URDF, check_clock, check_command, check_description_and_joints
-from support.roslib_process import install_roslib, roslib_client
+from support.rosbridge import install_roslib, roslib_client
 from support.samples import moving, static
 from support.wires import latched
 

@@ -7,8 +7,7 @@ import pytest
 pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
 
 from support.processes import until
-from support.rosbridge import rosbridge_server
-from support.roslib_process import install_roslib, roslib_client
+from support.rosbridge import install_roslib, rosbridge_server, roslib_client
 from support.samples import moving, static
 
 from tfbus import Bus

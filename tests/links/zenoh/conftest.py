@@ -1,6 +1,5 @@
 import pytest
-from support.processes import new_domain
-from support.programs import free_address
+from support.processes import free_address, new_domain
 
 
 @pytest.fixture

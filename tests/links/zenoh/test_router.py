@@ -4,8 +4,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
-from support.processes import until
-from support.programs import free_address
+from support.processes import free_address, until
 from support.samples import moving, static
 from support.wires import latched
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 from rosbags.rosbag1 import Reader
-from support.open_files import is_open
+from support.processes import is_open
 from support.recorded import messages_in
 from support.samples import moving
 

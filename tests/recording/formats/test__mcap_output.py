@@ -13,7 +13,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
-from support.open_files import is_open
+from support.processes import is_open
 from support.samples import moving, static
 from support.strategies import samples
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin
-from support.open_files import is_open
+from support.processes import is_open
 from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in
 from support.samples import moving, static
 

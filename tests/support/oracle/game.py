@@ -10,9 +10,22 @@ import anyio
 import pytest
 from anyio.abc import TaskGroup
 from support.asking import Asked
-from support.oracle.plain_bus import Held, Joined, Left, PlainBus, Published, Removed, Reset
-from support.oracle.plain_tree import Answer, At, Blocked, Facts, Sample, facts_of
-from support.oracle.pose import pose
+from support.oracle.model import (
+    Answer,
+    At,
+    Blocked,
+    Facts,
+    Held,
+    Joined,
+    Left,
+    PlainBus,
+    Published,
+    Removed,
+    Reset,
+    Sample,
+    facts_of,
+    pose,
+)
 from support.oracle.schedule import (
     OFFSETS,
     PREFIX,

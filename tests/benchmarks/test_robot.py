@@ -1,8 +1,9 @@
-"""The cost of a whole robot, from a message of its joints to transforms that are inserted in one buffer."""
+"""The cost of a whole robot, from a message of its joints to transforms in one buffer; and of simulated time."""
 
 from collections.abc import Callable
-from time import perf_counter
+from time import perf_counter, process_time
 
+import anyio
 import pytest
 from beside import Table, show
 from support import pr2
@@ -15,6 +16,7 @@ ROUNDS = 15
 RATE = 100.0
 WANTED = 0.25
 """Of one core."""
+FEW_ROUNDS, TICKS, CROWDS = 5, 2_000, (100, 1_000, 3_000)
 
 
 def seconds_a_message(publish: Callable[[RobotStatePublisher, pr2.JointState], None], model: RobotModel) -> float:
@@ -50,11 +52,35 @@ def test_a_pr2_from_joint_message_to_buffer(table: Table, kind: str) -> None:
     table.add(f"PR2, 82 frames, {kind}", show(rounds, "us"), core, "", f"<= {WANTED:.0%}")
 
 
-@pr2.needed
-def test_reading_the_urdf_of_a_pr2(table: Table) -> None:
-    rounds = []
-    for _ in range(ROUNDS):
-        start = perf_counter()
-        RobotModel.from_urdf(pr2.URDF)
-        rounds.append(perf_counter() - start)
-    table.add("PR2, from_urdf", show(rounds, "ms"))
+async def seconds_a_tick(robots: int) -> float:
+    """The processor time of a timed task that wakes and sleeps again, among others."""
+    clock = SimulatedClock()
+
+    async def robot() -> None:
+        async for _ in clock.ticks(1.0):
+            pass
+
+    async with anyio.create_task_group() as tasks:
+        for _ in range(robots):
+            tasks.start_soon(robot)
+        await clock.advance(0.0)
+        periods = max(1, TICKS // robots)
+        start = process_time()
+        await clock.advance(float(periods))
+        spent = process_time() - start
+        tasks.cancel_scope.cancel()
+    return spent / (periods * robots)
+
+
+@pytest.mark.parametrize("loop", ["asyncio", "uvloop", "trio"])
+def test_a_tick_costs_the_same_among_many(table: Table, loop: str) -> None:
+    backend = "trio" if loop == "trio" else "asyncio"
+    options = {"use_uvloop": True} if loop == "uvloop" else {}
+    rounds: dict[int, list[float]] = {robots: [] for robots in CROWDS}
+    for _ in range(FEW_ROUNDS):
+        for robots in CROWDS:
+            rounds[robots].append(anyio.run(seconds_a_tick, robots, backend=backend, backend_options=options))
+    fewest = sorted(rounds[CROWDS[0]])[FEW_ROUNDS // 2]
+    for robots in CROWDS:
+        ratio = sorted(rounds[robots])[FEW_ROUNDS // 2] / fewest
+        table.add(f"{loop}, a tick among {robots:,} robots", show(rounds[robots], "us"), "", f"{ratio:.2f}", "<= 1.5")
