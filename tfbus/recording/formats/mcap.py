@@ -64,6 +64,7 @@ from tfbus.recording.formats.storage import (
     separate,
     shortfalls,
     unfinished,
+    wrong_descriptions,
 )
 from tfbus.stamps import STAMP_MAX
 
@@ -436,11 +437,7 @@ class McapStorage:
 
     def _reports(self, reading: McapReading, now: int, read: Counter[Channel] | None) -> Iterator[StoredMessage]:
         """The faults that a reading has found; `read` has the number of the messages, if none was left out."""
-        if reading.unknown:
-            yield lost_message(now, f"{reading.unknown:,} messages are on channels that the file does not describe")
-        if reading.contradictions:
-            numbers = ", ".join(map(str, sorted(reading.contradictions)))
-            yield lost_message(now, f"the descriptions of channel {numbers} contradict each other")
+        yield from wrong_descriptions(now, "channel", reading.unknown, reading.contradictions)
         if read is not None and self._statistics is not None:
             promised = {channel: count or 0 for channel, count in self.channels.items() if reading.wants(channel)}
             yield from shortfalls(now, promised, read)

@@ -38,6 +38,7 @@ from tfbus.recording.formats.storage import (
     shortfalls,
     unfinished,
     unfold,
+    wrong_descriptions,
 )
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN
 
@@ -410,11 +411,7 @@ class Ros1Storage:
             now = stored[0]
             yield stored
         unknown = sum(count for number, count in counts.items() if number not in self._numbered)
-        if unknown:
-            yield lost_message(now, f"{unknown:,} messages are on connections that the file does not describe")
-        if self._contradictions:
-            numbers = ", ".join(map(str, sorted(self._contradictions)))
-            yield lost_message(now, f"the descriptions of connection {numbers} contradict each other")
+        yield from wrong_descriptions(now, "connection", unknown, self._contradictions)
         if since is None and until is None:
             known = {chunk.offset for chunk in chunks.values()}
             for chunk in self._chunks:

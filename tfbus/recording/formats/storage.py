@@ -5,7 +5,8 @@ which numpy decodes without a Python object for each. Nothing here knows a forma
 
 * Bounds. A few bytes can claim, or unfold to, more than any machine holds. A size beyond its bound is not read, and its
   place is reported. `tfbus.recording.open_recording` tells these numbers to users. `unfold` decompresses up to a bound.
-* Losses. `lost_message`, `unfinished` and `shortfalls` make the reports that stand in place of missing messages.
+* Losses. `lost_message`, `unfinished`, `shortfalls` and `wrong_descriptions` make the reports that stand in place of
+  missing messages.
 * Order. Chunks of a file may overlap in time. `merge_chunks` sorts their messages; `separate` finds the parts of an
   index that can be sorted by themselves, and `in_order` sorts packed messages.
 """
@@ -211,6 +212,27 @@ def shortfalls(received: int, promised: Mapping[Channel, int], read: Counter[Cha
         if found[topic] != count:
             detail = f"the file promises {count:,} messages on {topic!r}, and {found[topic]:,} were found"
             yield lost_message(received, detail)
+
+
+def wrong_descriptions(received: int, kind: str, unknown: int, contradictory: set[int]) -> Iterator[StoredMessage]:
+    """The reports of channels that a file describes not at all, or in two ways.
+
+    Parameters
+    ----------
+    received : int
+        The log time of the reports, in ns.
+    kind : str
+        The word of the format for a channel.
+    unknown : int
+        The number of messages on channels without a description.
+    contradictory : set of int
+        The numbers of channels with two descriptions.
+    """
+    if unknown:
+        yield lost_message(received, f"{unknown:,} messages are on {kind}s that the file does not describe")
+    if contradictory:
+        numbers = ", ".join(map(str, sorted(contradictory)))
+        yield lost_message(received, f"the descriptions of {kind} {numbers} contradict each other")
 
 
 class Storage(Protocol):
