@@ -182,6 +182,7 @@ BAD_NUMBERS = [math.nan, math.inf, -math.inf]
     ("arguments", "reason", "text"),
     [
         (((0, math.nan, 0),), "not finite", "translation"),
+        (((0, 10**400, 0),), "not finite", "translation"),
         (((1, 2),), "wrong length", "translation"),
         (((0.0, 0.0),), "wrong length", "translation"),
         (((0.0, 0.0, 0.0, 0.0),), "wrong length", "translation"),

@@ -325,3 +325,14 @@ def test_a_hold_is_a_value() -> None:
         with pytest.raises(dataclasses.FrozenInstanceError):
             setattr(value, name, 1)
         assert not hasattr(value, "__dict__")
+
+
+def test_many_time_travels_have_the_greater_extrapolation_and_gap_of_both_legs(tree: TransformTree) -> None:
+    found = tree.lookup_many(
+        "base", "base", [seconds(6.5)] * 2, source_at=[seconds(1.5), seconds(6.25)], fixed="odom", extrapolate=Hold(1.0)
+    )
+    assert found.translations[:, 0] == pytest.approx([1.5 - 6.0, 0.0])
+    assert found.extrapolated_by.tolist() == [seconds(0.5), seconds(0.5)]
+    assert found.gap is not None
+    assert found.gap.tolist() == [seconds(1.0), 0]
+    assert found[1:].extrapolated_by.tolist() == [seconds(0.5)]

@@ -138,6 +138,16 @@ def test_of_two_ways_round_a_loop_the_one_with_samples_counts(at: int) -> None:
         assert [edge.child for edge in path.moving] == ["a"]
 
 
+def test_two_ways_with_samples_are_no_way_unless_one_is_the_newest() -> None:
+    frames = loop_of(a_on_b=(0, 10), b_on_a=(5, 20))
+    assert [edge.child for edge in at_stamp(frames, "a", "b", 4).moving] == ["a"]
+    for target, source in (("a", "b"), ("b", "a")):
+        with pytest.raises(DisconnectedError) as caught:
+            at_stamp(frames, target, source, 7)
+        assert caught.value.stamp == 7
+        assert caught.value.loop in (("a", "b", "a"), ("b", "a", "b"))
+
+
 def test_waiting_helps_if_it_helps_on_one_of_two_ways() -> None:
     frames: Frames = {"a": moving_edge("b", "a", [(30, Transform())]), "b": moving_edge("a", "b", [(10, Transform())])}
     for target, source in (("a", "b"), ("b", "a")):
@@ -385,3 +395,14 @@ def test_paths_that_are_asked_for_are_kept_and_others_are_forgotten_in_time() ->
     assert cache.find("a", "49999") is kept
     assert [cache.holds("a", name) for name in ("0", "41000", "49999", "wanted")] == [False, True, True, True]
     assert not cache.holds("b", "wanted")
+
+
+class Name(str):
+    __slots__ = ()
+
+
+def test_names_that_are_no_plain_strings_are_not_kept() -> None:
+    cache = PathCache(Lock())
+    cache.keep(Name("a"), "b", path_of_one_edge())
+    cache.keep("a", Name("b"), path_of_one_edge())
+    assert len(cache) == 0

@@ -28,36 +28,6 @@ def history(keep: int | None = None, stamps: Iterable[int] = ()) -> FrameHistory
     return made
 
 
-@given(st.permutations(range(12)), st.data())
-def test_out_of_order_inside_the_window_gives_the_same_as_in_order(order: list[int], data: st.DataObject) -> None:
-    parents = data.draw(st.lists(st.sampled_from("pq"), min_size=12, max_size=12))
-    in_order, shuffled = history(), history()
-    for stamp in range(12):
-        in_order.insert(parents[stamp], stamp, row(float(stamp * stamp)), parents[stamp])
-    for stamp in order:
-        shuffled.insert(parents[stamp], stamp, row(float(stamp * stamp)), parents[stamp])
-
-    assert shuffled.edge() == in_order.edge()
-    assert set(shuffled.named_parents) == set(in_order.named_parents)
-    for stamp in range(-1, 13):
-        assert shuffled.covers(stamp) == in_order.covers(stamp)
-        assert shuffled.parent_at(stamp) == in_order.parent_at(stamp)
-        if in_order.covers(stamp):
-            assert shuffled.row_at(stamp) == in_order.row_at(stamp)
-
-
-# The window's slack, a sixteenth, is ten here: what has left the window is still in memory when the parent changes.
-@pytest.mark.parametrize("switch", [200, 165, 170, 175])
-def test_a_parent_is_forgotten_with_the_last_sample_in_the_window_that_names_it(switch: int) -> None:
-    samples = history(keep=160, stamps=range(switch))
-    for stamp in range(switch, switch + 200):
-        samples.insert("new", stamp, row(0.0), "")
-        oldest = max(0, stamp - 160)
-        expected = {"parent", "new"} if oldest < switch else {"new"}
-        assert set(samples.named_parents) == expected
-        assert samples.parent_at(oldest) == ("parent" if oldest < switch else "new")
-
-
 @given(
     st.lists(st.tuples(st.integers(0, 12), st.sampled_from("pq"), st.sampled_from(["", "sender"])), max_size=40),
     st.sampled_from([0, 5, 40, None]),

@@ -364,6 +364,33 @@ class Name(str):
 
 
 @needs_both
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        [5, True],
+        [5, 5.0],
+        [2**63],
+        [5, None],
+        5,
+        "5",
+        b"12345678",
+        np.array(5),
+        np.array([[5]]),
+        np.array([5], np.int32),
+        np.array([5], np.uint64),
+        np.array([5.0]),
+        np.array([5], ">i8"),
+        np.array([5], "M8[ns]"),
+        np.broadcast_to(np.int64(5), 2**58),
+        [],
+    ],
+)
+def test_the_compiled_kernel_hands_back_what_are_no_plain_stamps(stamps: Any) -> None:
+    asked = paths(COMPILED, cart=chain(COMPILED, [[(0, x(0.0)), (10, x(10.0))]], []))
+    assert asked.answer_many("map", "cart", stamps) is None
+
+
+@needs_both
 def test_the_compiled_kernel_answers_nothing_while_somebody_holds_the_lock() -> None:
     lock = threading.Lock()
     assert COMPILED is not None
@@ -523,6 +550,9 @@ def test_wrong_arguments_raise_and_never_crash() -> None:
         lambda: edge.between(0),
         lambda: edge.between(0, 0.5),
         lambda: edge.sample(1),
+        lambda: edge.sample(-1),
+        lambda: edge.stamp(1),
+        lambda: edge.stamp(-1),
         lambda: edge.take(5),
         lambda: edge.columns(0),
         lambda: setattr(edge, "parent", 5),

@@ -5,7 +5,6 @@ import math
 import pickle
 import re
 from functools import partial
-from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -45,31 +44,6 @@ def forest(*batch: TransformStamped) -> Forest:
 # Stamp, row and kind of an answer
 
 
-@pytest.mark.parametrize(
-    ("target", "source", "at", "stamp", "x", "is_static"),
-    [
-        ("a", "b", 5, 5, 5.0, False),
-        ("a", "b", LATEST, 30, 30.0, False),
-        ("b", "c", LATEST, 20, 20.0, False),
-        ("a", "d", LATEST, 20, 140.0, False),
-        ("c", "d", 77, 77, 100.0, True),
-        ("c", "d", LATEST, 40, 100.0, True),
-        ("d", "d", LATEST, 40, 0.0, True),
-        ("b", "b", LATEST, 30, 0.0, True),
-        ("a", "a", LATEST, 0, 0.0, True),
-        ("a", "a", 77, 77, 0.0, True),
-    ],
-)
-def test_find_gives_stamp_row_and_whether_the_answer_is_static(
-    target: str, source: str, at: int | Latest, stamp: int, x: float, is_static: bool
-) -> None:
-    known = forest(*over("a", "b", [0, 30]), *over("b", "c", [0, 20]), static("c", "d", 100.0, stamp=40))
-    found = find(known, target, source, at, None)
-    assert (found[0], found[1][0], found[2]) == (stamp, x, is_static)
-    assert type(found[0]) is int
-    assert find(known, target, source, at, None) == found, "the same with the cached path"
-
-
 def test_the_latest_answer_of_a_frame_in_itself_has_its_newest_stamp_and_zero_without_one() -> None:
     tree = tree_of(static("a", "b", stamp=0), moving("a", "c", 0), moving("a", "d", -7), moving("a", "e", 9))
     assert [tree.lookup(frame, frame).stamp for frame in "abcde"] == [0, 0, 0, -7, 9]
@@ -84,24 +58,6 @@ def test_latest_is_looked_up_on_the_path_at_the_newest_common_stamp() -> None:
 
 
 # Time travel
-
-
-@pytest.mark.parametrize(
-    ("target", "at", "source_at", "stamp", "x"),
-    [
-        ("cart", 8, 3, 8, -5.0),
-        ("cart", LATEST, 3, 10, -7.0),
-        ("cart", 8, LATEST, 8, 2.0),
-        ("cart", LATEST, LATEST, 10, 0.0),
-        ("map", 8, 3, 8, 3.0),
-    ],
-)
-def test_time_travel_has_the_stamp_of_the_target(
-    target: str, at: int | Latest, source_at: int | Latest, stamp: int, x: float
-) -> None:
-    known = forest(*over("map", "cart", [0, 10]))
-    found = find_in_time_travel(known, target, "cart", at, source_at, "map", None)
-    assert (found[0], found[1][0], found[2]) == (stamp, x, False)
 
 
 @pytest.mark.parametrize("target", ["wall", "map"])
@@ -251,15 +207,6 @@ def test_an_edge_above_the_common_ancestor_neither_fails_a_lookup_nor_decides_it
 # LATEST
 
 
-def test_latest_is_the_newest_stamp_of_the_lagging_edge_for_any_order_of_insertion() -> None:
-    for order in permutations([*over("a", "b", [10, 20]), *over("a", "c", [12, 17])]):
-        tree = tree_of(*order)
-        assert tree.latest_common_stamp("b", "c") == 17
-        assert tree.lookup("c", "b").stamp == 17
-        tree.insert(moving("a", "c", 25))
-        assert tree.lookup("c", "b").stamp == 20
-
-
 def test_latest_of_an_all_static_path_is_static_without_a_common_stamp() -> None:
     tree = tree_of(static("a", "b", 1.0, stamp=5), static("b", "c", 1.0, stamp=9), static("a", "d", stamp=7))
     assert tree.latest_common_stamp("a", "c") is None
@@ -327,27 +274,7 @@ def test_not_before_applies_to_both_legs_of_time_travel() -> None:
 # Parents over time
 
 
-def test_old_stamps_have_the_old_parent_and_its_last_value_is_held_until_the_new_parent() -> None:
-    tree = tree_of(
-        *over("left", "b", [0, 10]),
-        *over("right", "b", [20, 30]),
-        static("root", "left", 100.0),
-        static("root", "right", 500.0),
-    )
-    assert [x_of(tree, "root", "b", at) for at in (5, 10, 15, 19, 20, 25)] == [105.0, 110.0, 110.0, 110.0, 520.0, 525.0]
-    assert [tree.parent("b", at) for at in (5, 19, 20, LATEST)] == ["left", "left", "right", "right"]
-    assert tree.chain("root", "b", 19) == ["root", "left", "b"]
-    assert tree.chain("root", "b") == ["root", "right", "b"]
-
-
 # Static edges
-
-
-@pytest.mark.parametrize("at", [STAMP_MIN, -1, 0, 100, 1_000, STAMP_MAX])
-def test_a_static_edge_answers_at_every_stamp_with_that_stamp(at: int) -> None:
-    tree = tree_of(static("a", "b", 1.0, stamp=50), static("b", "c", 2.0))
-    found = tree.lookup("a", "c", at)
-    assert (found.stamp, found.static, found.transform.translation[0]) == (at, True, 3.0)
 
 
 # Frames

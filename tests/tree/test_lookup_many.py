@@ -657,3 +657,12 @@ def test_many_answers_have_the_bits_of_single_lookups(target: str, source: str, 
     single = [tree.lookup(target, source, stamp).transform for stamp in stamps.tolist()]
     expected = b"".join(struct.pack("7d", *one.translation, *one.rotation) for one in single)
     assert np.hstack((found.translations, found.rotations)).tobytes() == expected
+
+
+@pytest.mark.parametrize("question", [{"source_at": [5]}, {"source_at": 5}, {"fixed": "a"}])
+def test_source_at_without_fixed_and_fixed_without_source_at_are_type_errors(question: dict[str, Any]) -> None:
+    tree = tree_of(moving("a", "b", 5))
+    for _ in range(2):
+        with pytest.raises(TypeError, match="source_at and fixed go together"):
+            tree.lookup_many("a", "b", [5], **question)
+        assert len(tree.lookup_many("a", "b", [5])) == 1

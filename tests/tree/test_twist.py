@@ -107,18 +107,6 @@ def test_twists_are_exact_where_lookup_velocity_of_tf2_is_wrong(frame: str, axes
     check_twist(tree.twist(frame, "map", SECOND, expressed_in=axes), linear, Z)
 
 
-@pytest.mark.parametrize("time", INSTANTS)
-def test_a_rotating_observer_sees_a_resting_point_circle_in_the_opposite_direction(time: float) -> None:
-    rate, radius = 0.7, 3.0
-    tree = tree_of(*trajectory("map", "observer", turning(rate)), placed("map", "post", (radius, 0.0, 0.0)))
-    angle, speed = rate * time, rate * radius
-    at = round(time * SECOND)
-    check_twist(
-        tree.twist("post", "observer", at), (-speed * math.sin(angle), -speed * math.cos(angle), 0.0), (0.0, 0.0, -rate)
-    )
-    check_twist(tree.twist("post", "observer", at, expressed_in="map"), (0.0, -speed, 0.0), (0.0, 0.0, -rate))
-
-
 @given(
     rotations(),
     unit_vectors(),
@@ -423,3 +411,17 @@ def test_a_stamp_is_an_integer_or_latest(at: object) -> None:
 def test_a_frame_is_named_by_a_string(frame: str, reference: str, axes: str | None) -> None:
     with pytest.raises(TypeError, match="a frame name must be a str"):
         lines_of_two_trees().twist(frame, reference, expressed_in=axes)
+
+
+def gap(axes_first: bool) -> TransformTree:
+    """One of two frames has stopped before the other began."""
+    early, late = ("axes", "body") if axes_first else ("body", "axes")
+    first = [moving("map", early, second * SECOND) for second in (0, 1)]
+    return tree_of(*first, *(moving("map", late, second * SECOND) for second in (5, 6)))
+
+
+@pytest.mark.parametrize("axes_first", [True, False])
+def test_latest_without_a_common_stamp_waits_for_the_lagging_frame(axes_first: bool) -> None:
+    with pytest.raises(FutureExtrapolationError) as caught:
+        gap(axes_first).twist("body", "map", expressed_in="axes")
+    assert (caught.value.child, caught.value.stamp) == ("axes" if axes_first else "body", 5 * SECOND)

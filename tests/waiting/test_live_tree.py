@@ -138,6 +138,19 @@ def test_a_waiter_that_is_not_woken_still_has_no_answer(
                 ask(live, question)
 
 
+def test_late_samples_that_fill_the_common_stamp_wake_the_waiters_for_latest() -> None:
+    live = live_tree(None)
+    for sample in (moving("a", "d", 13), moving("d", "c", 16), moving("c", "b", 18), moving("a", "b", 16)):
+        live.insert((sample,))
+    with pytest.raises(TransformLookupError) as caught:
+        tree_over(live).lookup("b", "d")
+    woken: list[str] = []
+    live.waiting.park(Waiter(Question("b", "d", LATEST), 0, partial(woken.append, "d")), caught.value)
+    live.insert((moving("a", "d", 18),))
+    assert tree_over(live).can_transform("b", "d")
+    assert woken == ["d"]
+
+
 def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1), moving("map", "b", 1), static("map", "mount")))
