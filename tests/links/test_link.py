@@ -352,7 +352,7 @@ async def test_a_large_message_between_links_takes_many_turns_and_each_batch_of_
 ) -> None:
     carrier, heard = PartsCarrier(), []
     entries = [
-        OutgoingBatch(b"an origin, a bus", n, [moving("map", f"f{n}/{i}", 1) for i in range(samples)])  # type: ignore[arg-type]
+        OutgoingBatch(b"an origin, a bus", n, tuple(moving("map", f"f{n}/{i}", 1) for i in range(samples)))
         for n in range(batches)
     ]
     (message,) = MessageWriter(SendReport(print)).write(entries)

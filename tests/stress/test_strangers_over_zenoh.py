@@ -266,3 +266,32 @@ async def test_no_address_that_a_peer_names_ends_a_link(named: str) -> None:
                 del keep
             finally:
                 await anyio.to_thread.run_sync(session.close)
+
+
+async def test_a_flood_of_tokens_is_bounded_and_counted_and_a_friend_is_met_once_it_has_gone() -> None:
+    address, domain = free_address(), new_domain()
+    base = f"tfbus/{domain}/~"
+    chunk = urlsafe_b64encode(json.dumps([["*"], ["base"]]).encode()).decode()
+    with Bus() as bus, Bus() as other:
+        async with ZenohLink(bus, domain, listen=address) as link:
+            session = await anyio.to_thread.run_sync(zenoh.open, settings([], address, {"mode": "client"}, 2.0))
+
+            def flood() -> list[Any]:
+                declare = session.liveliness().declare_token
+                ids = [f"{number:032x}" for number in range(1, 1_201)]
+                tokens = [declare(f"{base}/@alive/{each}/0") for each in ids]
+                tokens += [declare(f"{base}/@alive/{ids[0]}/{name:032x}") for name in range(1, 101)]
+                tokens += [declare(f"{base}/@only/{ids[0]}/{name:032x}/{chunk}") for name in range(2_100)]
+                return tokens
+
+            tokens = await anyio.to_thread.run_sync(flood)
+            await until(lambda: link.statistics().rejected.get("filter", 0) >= 100)
+            await until(lambda: link.statistics().rejected.get("too many tokens", 0) >= 280)
+            assert len(link.peers) <= 1_000
+            tokens.clear()
+            await anyio.to_thread.run_sync(session.close)
+            await until(lambda: not link.peers)
+            async with ZenohLink(other, domain, connect=address) as friend:
+                await until(lambda: bool(friend.peers and link.peers))
+                other.publish(static("map", "lamp"))
+                await until(lambda: bus.statistics().frames > 0)

@@ -1,14 +1,18 @@
 import importlib.util
 import json
+import math
 import struct
 import sys
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager, contextmanager
+from itertools import count
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import anyio
+import anyio.to_thread
 import pytest
 import zenoh
 import zenoh.ext
@@ -18,9 +22,21 @@ from support.processes import free_ports, until
 from support.samples import moving, static
 from support.wires import latched
 
-from tfbus import SECOND, Buffer, Bus, PeerRejected
+from tfbus import SECOND, Buffer, Bus, PeerRejected, SimulatedClock
 from tfbus.links.rmw_zenoh import RmwZenohLink
-from tfbus.links.rmw_zenoh.rmw_zenoh_link import HASH, JOINT_HASH, JOINT_TYPE, TEXT_HASH, TEXT_TYPE, TYPE, _config
+from tfbus.links.rmw_zenoh.rmw_zenoh_link import (
+    CLOCK_HASH,
+    CLOCK_TYPE,
+    HASH,
+    JOINT_HASH,
+    JOINT_TYPE,
+    TEXT_HASH,
+    TEXT_TYPE,
+    TYPE,
+    Attachment,
+    _config,
+    pack,
+)
 from tfbus.links.zenoh import ZenohRouter
 from tfbus.tf_message import encode
 
@@ -257,3 +273,93 @@ async def test_a_router_that_is_not_there_is_an_os_error() -> None:
     with Bus() as bus, pytest.raises(OSError, match=rf"no router of rmw_zenoh: [^/]*tcp/127.0.0.1:{port}[^/]*$"):
         async with RmwZenohLink(bus, f"tcp/127.0.0.1:{port}", config={"connect/timeout_ms": 500}):
             raise AssertionError
+
+
+BLOCK = zenoh.CongestionControl.BLOCK
+NAMES = [b"\xff\xfe", b"a\0b", b"\n\x1b[2J", b"///"]
+NUMBERS = [math.nan, math.inf, -1e308, 1e13]
+
+
+def mutated(random: Random, message: bytes) -> bytes:
+    """A message with some of its bytes changed, cut, or put in."""
+    data = bytearray(message)
+    for _ in range(random.randint(1, 3)):
+        at = random.randrange(len(data) + 1)
+        match random.randrange(6):
+            case 0:
+                data[at : at + 1] = random.randbytes(1)
+            case 1:
+                data[at - at % 4 : at - at % 4 + 4] = struct.pack("<I", random.choice([0, 1, 2**16, 2**31, 2**32 - 1]))
+            case 2:
+                del data[at:]
+            case 3:
+                data[at:at] = random.randbytes(random.choice([1, 8, 1_000]))
+            case 4 if (place := data.find(struct.pack("<d", 1.5))) >= 0:
+                data[place : place + 8] = struct.pack("<d", random.choice(NUMBERS))
+            case _ if (place := data.find(b"frame")) >= 0:
+                name = random.choice(NAMES)
+                data[place : place + len(name)] = name
+    return bytes(data)
+
+
+@pytest.mark.parametrize("cases", [300, pytest.param(10_000, marks=pytest.mark.thorough)])
+async def test_no_damaged_message_attachment_or_key_ends_a_link_and_each_is_counted_or_heard(
+    cases: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    random = Random(cases)
+    clock = SimulatedClock()
+    heard: set[str] = set()
+    taken: list[Any] = []
+    text = b"\0\1\0\0" + struct.pack("<I", 9) + b"<robot/>\0"
+    transforms = [encode([moving("map", f"frame{number}", 5, 1.5) for number in range(size)]) for size in (1, 3, 400)]
+    good = {
+        f"tf/{TYPE}/{HASH}": transforms,
+        f"tf_static/{TYPE}/{HASH}": transforms[:2],
+        f"joint_states/{JOINT_TYPE}/{JOINT_HASH}": [joint_state(5, {"frame": 1.5})],
+        f"clock/{CLOCK_TYPE}/{CLOCK_HASH}": [b"\0\1\0\0" + struct.pack("<iI", 5, 6)],
+        f"robot_description/{TEXT_TYPE}/{TEXT_HASH}": [text],
+    }
+    with Bus(SimulatedClock(), max_ahead=None) as bus:
+        bus.subscribe(lambda batch: heard.update(sample.child for sample in batch))
+        async with (
+            router() as address,
+            RmwZenohLink(
+                bus,
+                address,
+                DOMAIN,
+                clock=clock,
+                max_frames=10**6,
+                joint_states=lambda *joints: taken.append(joints),
+                robot_description=taken.append,
+            ) as link,
+        ):
+            session = await anyio.to_thread.run_sync(zenoh.open, _config(address, {}))
+            attachment = pack(Attachment(1, 2, b"a publisher of 16"[:16]))
+
+            def storm() -> None:
+                for _ in range(cases):
+                    key, payloads = random.choice(list(good.items()))
+                    key = random.choice([key, key, key, key.rpartition("/")[0] + "/x", key + "/x", "tf/x/y"])
+                    with_it = random.choice([attachment, None, mutated(random, attachment), b"", bytes(100_000)])
+                    payload = mutated(random, random.choice(payloads))
+                    session.put(f"{DOMAIN}/{key}", payload, attachment=with_it, congestion_control=BLOCK)
+                    session.delete(f"{DOMAIN}/{key}")
+                session.put(f"{DOMAIN}/tf/{TYPE}/{HASH}", bytes(5_000_000))
+
+            try:
+                await anyio.to_thread.run_sync(storm)
+                for stamp in count(1):
+                    session.put(f"{DOMAIN}/tf/{TYPE}/{HASH}", encode([moving("map", "last", stamp)]))
+                    await anyio.sleep(0.01)
+                    if "last" in heard and link.statistics().queue.pending == 0:
+                        break
+            finally:
+                await anyio.to_thread.run_sync(session.close)
+            counts = link.statistics()
+            # Two in three have a key that the link takes, and the queue drops none.
+            assert counts.received_messages + sum(counts.rejected.values()) > cases / 2
+            assert counts.queue.dropped == 0
+            for reason in ("truncated", "oversized", "not finite", "frame name"):
+                assert counts.rejected[reason], (reason, counts.rejected)
+            assert "not published" not in counts.rejected
+    assert [record for record in caplog.records if record.levelname in ("ERROR", "CRITICAL")] == []

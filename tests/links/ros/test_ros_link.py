@@ -1,14 +1,21 @@
-import struct
+""""""
 
+import struct
+from collections.abc import Mapping
+
+import anyio
 import pytest
+from support.joint_messages import joint_state
 from support.processes import until
-from support.ros import ListCarrier
+from support.ros import ListCarrier, RosEnd, named
 from support.samples import moving, static
 
-from tfbus import Bus, SimulatedClock, from_seconds
+from tfbus import Bus, PeerRejected, SimulatedClock, from_seconds
+from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros import RosLink, RosOptions
-from tfbus.links.ros.ros_link import RosMessage
+from tfbus.links.ros.ros_link import MOST_TRANSFORMS, RosMessage
+from tfbus.links.ros.settings import settings_of
 from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.anyio
@@ -96,3 +103,210 @@ def test_numbers_of_a_link_to_ros_are_checked() -> None:
     for options in (RosOptions(capacity=0), RosOptions(max_frames=0)):
         with pytest.raises(ValueError):
             RosLink(Bus(), "ros", ListCarrier(), **options)
+
+
+AS_A_CARRIER: type[Carrier] = ListCarrier
+"""That it fits the protocol, mypy says."""
+
+
+def test_what_comes_from_ros_has_the_node_as_its_authority_and_the_kind_of_its_topic() -> None:
+    end = RosEnd()
+    end.hear(moving("map", "base", 5, 1.0), moving("base", "arm", 6, 2.0))
+    end.hear(static("map", "lidar", 3.0, stamp=7), static=True, authority="/calibration")
+    assert end.heard == [
+        (moving("map", "base", 5, 1.0, "/node"), moving("base", "arm", 6, 2.0, "/node")),
+        (static("map", "lidar", 3.0, 7, "/calibration"),),
+    ]
+    end.endpoint.send()
+    assert end.carrier.said == [], "nothing goes back"
+
+
+def test_the_authority_of_all_that_comes_in_may_be_given() -> None:
+    end = RosEnd(authority="robot")
+    end.hear(moving("map", "base", 5))
+    end.hear(static("map", "lidar"), static=True)
+    assert [batch[0].authority for batch in end.heard] == ["robot", "robot"]
+
+
+def test_leading_slashes_leave_on_the_way_in() -> None:
+    end = RosEnd()
+    end.hear_bytes(named(named(encode([moving("-map", "--base", 5)]), "-map", "/map"), "--base", "//base"))
+    assert end.heard == [(moving("map", "base", 5, authority="/node"),)]
+
+
+def test_what_the_bus_refuses_is_counted_by_reason_and_announced_once_and_the_rest_is_published() -> None:
+    end = RosEnd()
+    with end.bus.events() as events:
+        for stamp in (1, 2):
+            own_parent = named(encode([moving("self", "also", stamp)]), "also", "self")
+            end.hear_bytes(own_parent)
+            end.hear_bytes(named(encode([moving("-", "a", stamp), moving("map", "b", stamp)]), "-", "/"))
+            end.hear_bytes(b"garbage")
+    rejected = [event for event in iter(events.queue.get, None) if isinstance(event, PeerRejected)]
+    assert end.endpoint.peers.rejected == {"self transform": 2, "frame name": 2, "truncated": 2}
+    assert [event.reason for event in rejected] == ["self transform", "frame name", "truncated"]
+    assert [event.peer for event in rejected] == ["peer"] * 3
+    assert getattr(rejected[0].error, "authority", "") == "/node"
+    assert [[sample.child for sample in batch] for batch in end.heard] == [["b"], ["b"]]
+
+
+def test_a_message_without_a_transform_is_nothing() -> None:
+    end = RosEnd()
+    end.hear()
+    assert end.heard == []
+    assert end.endpoint.peers.rejected == {}
+    assert end.endpoint.inbox.messages == 1
+
+
+def test_moving_frames_of_a_turn_go_out_together_and_static_ones_with_all_others_that_this_link_sends() -> None:
+    end = RosEnd()
+    end.bus.publish([moving("map", "base", 1), static("base", "lidar", stamp=2)])
+    end.say(moving("map", "base", 3))
+    end.say(static("base", "camera", stamp=4))
+    end.hear(static("base", "imu", stamp=5), static=True)
+    end.endpoint.send()
+    end.say(static("base", "lidar", stamp=6))
+    lidar, camera = ("base", "lidar", 2), ("base", "camera", 4)
+    assert end.carrier.said == [
+        (False, [("map", "base", 1), ("map", "base", 3)]),
+        (True, [lidar]),
+        (True, [lidar, camera]),
+        (True, [("base", "lidar", 6), camera]),
+    ]
+    assert (end.report.messages, end.report.samples) == (4, 7)
+
+
+def test_a_removed_static_frame_is_missing_in_the_next_message_and_a_moving_one_is_counted() -> None:
+    end = RosEnd()
+    end.say(static("map", "lidar"), static("map", "camera"), moving("map", "base", 1))
+    end.bus.remove_frame("lidar")
+    end.bus.remove_frame("base")
+    end.endpoint.send()
+    assert end.carrier.said[2:] == [(True, [("map", "camera", 0)])]
+    end.bus.remove_frame("camera")
+    end.endpoint.send()
+    assert end.carrier.said[3:] == [(True, [])]
+    assert end.report.not_sent == {"removal": 1}
+    assert ["'base'" in str(error) for error in end.errors] == [True]
+
+
+def test_a_static_frame_that_begins_to_move_leaves_the_latched_message() -> None:
+    end = RosEnd()
+    end.say(static("map", "lidar"), static("map", "camera"))
+    end.say(moving("map", "lidar", 5))
+    assert end.carrier.said[1:] == [(False, [("map", "lidar", 5)]), (True, [("map", "camera", 0)])]
+
+
+def test_what_a_message_cannot_hold_is_counted_and_the_rest_goes_out() -> None:
+    end = RosEnd()
+    end.say(moving("map", "late", 2**62), moving("map", "base", 1), static("map", "x" * 2_000), static("map", "b"))
+    assert end.carrier.said == [(False, [("map", "base", 1)]), (True, [("map", "b", 0)])]
+    assert end.report.not_sent == {"stamp": 1, "frame name": 1}
+    end.say(static("map", "c"))
+    assert end.report.not_sent == {"stamp": 1, "frame name": 1}, "once for each sample"
+
+
+def test_many_moving_frames_go_out_in_several_messages() -> None:
+    end = RosEnd()
+    end.say(*(moving("map", f"f{number}", 1) for number in range(2 * MOST_TRANSFORMS + 1)))
+    assert [len(rows) for _, rows in end.carrier.said] == [MOST_TRANSFORMS, MOST_TRANSFORMS, 1]
+    assert [row[1] for _, rows in end.carrier.said for row in rows] == [f"f{n}" for n in range(2 * MOST_TRANSFORMS + 1)]
+
+
+def test_with_a_prefix_only_the_frames_of_that_robot_go_out_by_their_names_there() -> None:
+    end = RosEnd(prefix="r1/", shared={"map"})
+    end.hear(moving("odom", "base", 1))
+    assert end.heard == [(moving("r1/odom", "r1/base", 1, authority="/node"),)]
+    end.say(moving("map", "r1/odom", 2), moving("map", "r2/odom", 2), static("r1/base", "r1/lidar"))
+    end.say(moving("world", "r1/x", 3))
+    end.bus.remove_frame("r2/odom")
+    end.endpoint.send()
+    assert end.carrier.said == [(False, [("map", "odom", 2)]), (True, [("base", "lidar", 0)])]
+    assert end.report.not_sent == {"prefix": 1}
+    end.hear(moving("odom", "r1/b", 1))
+    assert end.endpoint.peers.rejected == {"prefix": 1}
+    end.bus.remove_frame("r1/lidar")
+    end.endpoint.send()
+    assert end.carrier.said[-1] == (True, [])
+
+
+def test_a_link_that_only_listens_sends_nothing() -> None:
+    end = RosEnd(send=False)
+    end.say(moving("map", "base", 1), static("map", "lidar"))
+    end.bus.remove_frame("base")
+    end.endpoint.send()
+    assert end.carrier.said == []
+    assert (end.report.messages, end.report.not_sent) == (0, {})
+
+
+def test_what_ros_gives_back_is_no_news() -> None:
+    end = RosEnd()
+    end.say(moving("map", "base", 1, 5.0), static("map", "lidar", 2.0))
+    end.hear(moving("map", "base", 1, 5.0))
+    end.hear(static("map", "lidar", 2.0), static=True)
+    assert (len(end.heard), end.endpoint.inbox.duplicates) == (1, 2)
+    end.hear(static("map", "lidar", 3.0), static=True)
+    assert end.heard[1:] == [(static("map", "lidar", 3.0, authority="/node"),)]
+
+
+def test_after_a_jump_back_of_the_clock_the_stamps_of_before_are_news() -> None:
+    end = RosEnd()
+    for jumps in range(2):
+        end.hear(moving("map", "base", 1, 5.0))
+        end.hear(static("map", "lidar", 2.0), static=True)
+        assert len(end.heard) == 2 + jumps
+        end.endpoint.clock_jumped_back()
+
+
+def test_frames_that_were_lost_with_their_peer_come_back_as_they_were() -> None:
+    end = RosEnd()
+    end.hear(static("map", "lidar", 2.0), static=True)
+    peer = end.endpoint.peers.forget("peer")
+    assert peer is not None
+    end.endpoint._relay.lose(peer, end.endpoint.outbox, drop=True)
+    assert end.bus.statistics().frames == 0
+    end.hear(static("map", "lidar", 2.0), static=True)
+    assert end.bus.statistics().frames == 1
+
+
+def test_static_frames_can_be_sent_once_more() -> None:
+    end = RosEnd()
+    end.carrier._publish_statics()
+    assert end.carrier.said == []
+    end.say(static("map", "lidar"))
+    end.carrier._publish_statics()
+    assert end.carrier.said == [(True, [("map", "lidar", 0)])] * 2
+
+
+def test_opening_gives_the_carrier_its_callbacks() -> None:
+    carrier = ListCarrier()
+    assert (carrier.id, carrier.settings.tf) == ("list", settings_of({}).tf)
+    received: list[object] = []
+    report = SendReport(print)
+    anyio.run(carrier.open, received.append, report)
+    assert (carrier._receive, carrier._report) == (received.append, report)
+
+
+def test_no_cut_message_is_published_or_raises() -> None:
+    end = RosEnd()
+    whole = encode([moving("map", "base", 5)])
+    for size in range(len(whole) - 8):
+        end.hear_bytes(whole[:size])
+    assert end.heard == []
+    assert sum(end.endpoint.peers.rejected.values()) == len(whole) - 8
+
+
+def test_positions_of_joints_are_handed_on_and_what_comes_of_that_is_counted() -> None:
+    taken: list[tuple[Mapping[str, float], int]] = []
+
+    def take(positions: Mapping[str, float], stamp: int) -> None:
+        taken.append((positions, stamp))
+        if "broken" in positions:
+            raise ValueError(positions)
+
+    end = RosEnd(joint_states=take)
+    for payload in (joint_state(5, {"a": 0.5, "b": 1.5}), b"garbage", joint_state(6, {"broken": 1.0})):
+        end.endpoint.handle(Received("peer", RosMessage(payload, static=False, authority="", joints=True)))
+    assert taken == [({"a": 0.5, "b": 1.5}, 5), ({"broken": 1.0}, 6)]
+    assert end.endpoint.peers.rejected == {"truncated": 1, "not published": 1}
+    assert end.heard == []

@@ -16,6 +16,8 @@ from tfbus.links._hash import hash_bytes
 
 MOST_FILTERS = 100
 """So many filters are served; whoever has another one hears all."""
+MOST_TOKENS = 2_000
+"""So many tokens of filters are noted; a link whose token is not hears all."""
 LONGEST_FILTER = 16_000
 """Characters of a key: about 500 names of 20 letters."""
 
@@ -103,7 +105,10 @@ class Filters:
             If the filter cannot be served.
         """
         with self._lock:
-            tokens = self._tokens.setdefault(chunk, set())
+            tokens = self._tokens.get(chunk, set())
+            if token not in tokens and self._links.total() >= MOST_TOKENS:
+                raise ValueError(f"more than {MOST_TOKENS} tokens of filters")
+            self._tokens[chunk] = tokens
             if token not in tokens:
                 tokens.add(token)
                 self._links[token[0]] += 1

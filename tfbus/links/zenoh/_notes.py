@@ -4,7 +4,7 @@ import math
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import anyio
 import zenoh
@@ -14,6 +14,8 @@ from tfbus.links._receive_queue import Presence
 
 MOST_ASKING = 1_000
 """So many questions, and so many links that hear this one, are noted at once."""
+MOST_NOTED = 10_000
+"""So many changes, connections, and answers each are noted at once."""
 
 
 class Noted(NamedTuple):
@@ -39,6 +41,8 @@ class Notes:
     ----------
     now : callable
         Returns a monotonic time in s.
+    overflowed : callable, optional
+        Called for each note that is left out, because there are too many of its kind.
 
     Attributes
     ----------
@@ -46,8 +50,9 @@ class Notes:
         The time of the oldest note, in s; infinite while there is none.
     """
 
-    def __init__(self, now: Callable[[], float]) -> None:
+    def __init__(self, now: Callable[[], float], overflowed: Callable[[], object] = lambda: None) -> None:
         self._now = now
+        self._overflowed = overflowed
         self._lock = threading.Lock()
         self._noted = Noted([], [], [], [], set())
         self._stirred = anyio.Event()
@@ -60,15 +65,11 @@ class Notes:
 
     def add_change(self, peer: str, presence: Presence) -> None:
         """Note that a peer has come or gone."""
-        with self._lock:
-            self._noted.changes.append((peer, presence))
-            self._stir()
+        self._add("changes", (peer, presence))
 
     def add_connection(self, session: str, near: str, far: str) -> None:
         """Note that a connection to a session, between two addresses, has come or gone."""
-        with self._lock:
-            self._noted.connected.append((session, near, far))
-            self._stir()
+        self._add("connected", (session, near, far))
 
     def add_question(self, query: zenoh.Query) -> bool:
         """Note a question whether its sender is heard; returns False, and notes nothing, if there are too many."""
@@ -81,9 +82,7 @@ class Notes:
 
     def add_answer(self, peer: str, names: list[str] | None, named: bytes) -> None:
         """Note the answer of a peer to such a question."""
-        with self._lock:
-            self._noted.heard_by.append((peer, names, named))
-            self._stir()
+        self._add("heard_by", (peer, names, named))
 
     def add_hearer(self, peer: str) -> None:
         """Note that a peer hears this link, unless there are too many of them."""
@@ -110,6 +109,16 @@ class Notes:
         if self.since == math.inf:
             with anyio.move_on_after(due - self._now()):
                 await self._stirred.wait()
+
+    def _add(self, kind: Literal["changes", "connected", "heard_by"], note: Any) -> None:
+        with self._lock:
+            notes = getattr(self._noted, kind)
+            is_full = len(notes) >= MOST_NOTED
+            if not is_full:
+                notes.append(note)
+            self._stir()
+        if is_full:
+            self._overflowed()
 
     def _stir(self) -> None:
         self.since = min(self.since, self._now())

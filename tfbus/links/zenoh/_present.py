@@ -3,13 +3,17 @@
 import threading
 from collections.abc import Callable, Iterator, Mapping
 
+from tfbus.links._peers import MAX_PEERS
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.zenoh._keys import ANY_ROBOT, FIRST_SESSION, NO_ROBOT
 from tfbus.links.zenoh._session import ZenohSession
+from tfbus.tf_message import MalformedMessageError
 
 Way = tuple[ZenohSession | None, str]
 """A connection between two links: the patch here, or None for the first session, and the name of the session there."""
 DIRECT: Way = (None, FIRST_SESSION)
+MOST_WAYS = 20
+"""So many ways of one peer are noted."""
 
 
 class Present(Mapping[str, frozenset[Way]]):
@@ -64,6 +68,10 @@ class Present(Mapping[str, frozenset[Way]]):
         """Note that a peer has come or gone by one of its ways."""
         with self._lock:
             before = self._ways.get(peer, frozenset())
+            if presence is Presence.JOINED and way not in before and self._is_full(before):
+                detail = f"more than {MAX_PEERS} peers, or {MOST_WAYS} sessions of one, have announced themselves"
+                self._receive(Received(peer, MalformedMessageError("too many tokens", detail)))
+                return
             after = before | {way} if presence is Presence.JOINED else before - {way}
             if after:
                 self._ways[peer] = after
@@ -77,6 +85,9 @@ class Present(Mapping[str, frozenset[Way]]):
                 self._receive(Received(peer, presence))
             if changed or way == DIRECT:
                 self._note_change(peer, presence)
+
+    def _is_full(self, ways: frozenset[Way]) -> bool:
+        return len(ways) >= MOST_WAYS if ways else len(self._ways) >= MAX_PEERS
 
     def end(self, peer: str, patch: ZenohSession) -> None:
         """Note that a peer is reached by a patch no more."""

@@ -28,7 +28,7 @@ from tfbus.links.zenoh._hearing import DEAF, Hearing
 from tfbus.links.zenoh._introductions import Introductions
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._listening import Listening
-from tfbus.links.zenoh._notes import MOST_ASKING, Noted, Notes
+from tfbus.links.zenoh._notes import MOST_ASKING, MOST_NOTED, Noted, Notes
 from tfbus.links.zenoh._opening import OpenQuestion, guarded, refusal
 from tfbus.links.zenoh._patch import Patch
 from tfbus.links.zenoh._present import Present
@@ -67,7 +67,7 @@ class ZenohSessions:
         self._keys = keys
         self._receive = receive
         self._lock = threading.Lock()
-        self._notes = Notes(monotonic)
+        self._notes = Notes(monotonic, self._refuse_note)
         self._filters = Filters(keys.robot)
         self._unserved: set[str] = set()
         self._present = Present(receive, self._notes.add_change)
@@ -396,6 +396,10 @@ class ZenohSessions:
 
     def _note_directly(self, link: str, name: str, presence: Presence, robot: str) -> None:
         self._present.note(link, (None, name), presence, robot)
+
+    def _refuse_note(self) -> None:
+        detail = f"more than {MOST_NOTED} peers or connections have come or gone before this link has looked"
+        self._receive(Received("", MalformedMessageError("too many tokens", detail)))
 
     def _note_served(self, peer: str, served: bool) -> None:
         with self._lock:

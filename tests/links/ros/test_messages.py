@@ -1,3 +1,5 @@
+""""""
+
 import json
 import struct
 from typing import Any
@@ -5,11 +7,12 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.joint_messages import TYPES
 from support.ros import ros1, ros1_of
 from support.samples import moving
 
 from tfbus import Transform, TransformStamped
-from tfbus.links.ros.messages import as_mapping, decode_mapping, decode_ros1
+from tfbus.links.ros.messages import as_mapping, decode_clock, decode_mapping, decode_ros1, decode_text
 from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
 SAMPLES = [
@@ -129,3 +132,56 @@ def test_names_of_a_mapping_are_checked_as_those_of_bytes() -> None:
         decoded = decode_mapping({"transforms": [row]})
         assert decoded.samples == [None]
         assert [error.reason for error in decoded.errors] == ["frame name"]
+
+
+KIND = "rosgraph_msgs/msg/Clock"
+
+
+def test_a_time_is_read_from_every_encoding() -> None:
+    kinds = TYPES.types
+    cdr = bytes(TYPES.serialize_cdr(kinds[KIND](kinds["builtin_interfaces/msg/Time"](5, 7)), KIND))
+    big = b"\0\0\0\0" + struct.pack(">iI", 5, 7)
+    fields = [{"clock": {"sec": 5, "nanosec": 7}}, {"clock": {"secs": 5, "nsecs": 7}}]
+    for content in (cdr, big, bytes(TYPES.cdr_to_ros1(cdr, KIND)), *fields):
+        assert decode_clock(content) == 5_000_000_007
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\0\1\0\0", bytes(9), b"\1" * 12, None, {}, {"clock": 5}, {"clock": {"sec": 1}}]
+)
+def test_what_holds_no_time_is_malformed(content: Any) -> None:
+    with pytest.raises(MalformedMessageError):
+        decode_clock(content)
+
+
+URDF = "<robot name='\u00e4'/>"
+RAW = URDF.encode()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        struct.pack("<I", len(RAW)) + RAW,
+        b"\0\1\0\0" + struct.pack("<I", len(RAW) + 1) + RAW + b"\0",
+        b"\0\0\0\0" + struct.pack(">I", len(RAW) + 1) + RAW + b"\0",
+        # Aligned to four bytes, as some middlewares do.
+        b"\0\1\0\0" + struct.pack("<I", len(RAW) + 1) + RAW + b"\0\0\0",
+        {"data": URDF},
+    ],
+)
+def test_the_text_of_either_ros(content: Any) -> None:
+    assert decode_text(content) == URDF
+
+
+@pytest.mark.parametrize("content", [bytes(4), b"\0\1\0\0" + bytes(4), b"\0\1\0\0\1\0\0\0\0", {"data": ""}])
+def test_a_text_may_be_empty(content: Any) -> None:
+    assert decode_text(content) == ""
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"\0\1\0\0", b"\7\7\0\0\0\0\0\0", b"\0\1\0\0\5\0\0\0a", b"\1\0\0\0\xff", {}, {"data": 5}, None, [1]],
+)
+def test_what_is_no_text_is_refused(content: Any) -> None:
+    with pytest.raises(MalformedMessageError):
+        decode_text(content)
