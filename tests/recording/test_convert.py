@@ -1,28 +1,52 @@
+"""A recording becomes another one, in another format or with edits."""
+
+import json
 import sqlite3
 import struct
+import sys
+from contextlib import closing
+from dataclasses import FrozenInstanceError
+from hashlib import md5
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import zstandard
+from foxglove.messages import FrameTransform, FrameTransforms, Quaternion, Timestamp, Vector3
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 from support.open_files import is_open
 from support.recorded import SMALL, Line, batches_in, messages_in, sender_of, write_mcap
 from support.samples import moving, static
+from support.strategies import CHARACTERS
 
 from tfbus import RecordingError
 from tfbus.recording import Conversion, Edits, convert, load, open_recording
+from tfbus.recording.formats.copies import (
+    FRAME_TRANSFORMS,
+    BagCopy,
+    CannotWriteError,
+    FoxgloveCopy,
+    McapCopy,
+    MessageTypes,
+    SqliteCopy,
+    foxglove_channel,
+    transform_channel,
+    types_with_header,
+    write_protobuf,
+)
+from tfbus.recording.formats.mcap_output import TYPE_HASH
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.formats.transforms import RawTransform, parser_of, write_cdr, write_ros1
 from tfbus.recording.load import MAX_DETAILS
 from tfbus.recording.recording import open_storage
-from tfbus.tf_message import encode
+from tfbus.tf_message import MalformedMessageError, encode
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 TF = "tf2_msgs/msg/TFMessage"
@@ -397,3 +421,289 @@ def test_a_link_that_somebody_has_made_beside_the_output_leads_nowhere(tmp_path:
     assert precious.read_bytes() == b"precious"
     assert not output.is_symlink()
     assert sorted(tmp_path.iterdir()) == sorted([*before, output])
+
+
+SLASHED = RawTransform(1, 2, b"/odom", b"/base", bytes(56))
+
+
+def test_edits_are_frozen() -> None:
+    with pytest.raises(FrozenInstanceError):
+        Edits().prefix = "r/"  # type: ignore[misc]
+
+
+def test_without_edits_nothing_changes_not_even_a_leading_slash() -> None:
+    assert Edits() == Edits(frames=None, rename={}, prefix="", drop_static=False)
+    assert Edits().apply(SLASHED) == SLASHED
+    assert not Edits().changes_messages
+    assert not Edits(drop_static=True).changes_messages
+    assert Edits(frames=()).changes_messages
+
+
+def test_names_are_compared_without_their_slashes() -> None:
+    assert Edits(rename={"base": "body"}).apply(SLASHED)[2:4] == (b"/odom", b"body")
+    assert Edits(prefix="r/").apply(SLASHED)[2:4] == (b"r/odom", b"r/base")
+    assert Edits(frames=["base"]).keeps(SLASHED)
+    assert not Edits(frames=["odom"]).keeps(SLASHED)
+
+
+def test_a_name_that_is_no_text_keeps_its_bytes() -> None:
+    broken = SLASHED._replace(child=b"\xffbase")
+    assert Edits(prefix="r/").apply(broken).child == b"r/\xffbase"
+
+
+TF_CHANNEL = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr")
+PAYLOAD = encode([moving("a", "b", 5)])
+
+
+@pytest.mark.parametrize("kind", [McapCopy, BagCopy, SqliteCopy])
+def test_a_message_is_written_once_for_each_of_two_channels_of_one_topic(
+    tmp_path: Path, kind: type[McapCopy] | type[BagCopy] | type[SqliteCopy]
+) -> None:
+    path = tmp_path / "run"
+    copy = kind(path, "run")
+    same = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr")
+    for received, channel in ((1, TF_CHANNEL), (2, same), (3, TF_CHANNEL)):
+        copy.write(channel, received, PAYLOAD)
+    copy.finish()
+    assert not is_open(path)
+    assert [(message.received, message.batch) for message in messages_in(path)] == [
+        (received, (moving("a", "b", 5),)) for received in (1, 2, 3)
+    ]
+
+
+def test_a_copy_in_mcap_is_a_recording_of_ros_2(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    copy = McapCopy(path, "run")
+    copy.write(Channel("/log", "", "json"), 5, b"{}")
+    copy.write(TF_CHANNEL, 6, PAYLOAD)
+    copy.finish()
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        assert [(entry.name, entry.metadata) for entry in reader.iter_metadata()] == [("rosbag2", {})]
+        assert (reader.get_header().profile, reader.get_header().library) == ("ros2", "tfbus")
+        # A message without a type has no schema.
+        found = [
+            (schema and schema.name, channel.topic, each.log_time, each.publish_time, each.data)
+            for schema, channel, each in reader.iter_messages()
+        ]
+    assert found == [(None, "/log", 5, 5, b"{}"), ("tf2_msgs/msg/TFMessage", "/tf", 6, 6, PAYLOAD)]
+
+
+def test_times_before_1970_are_refused_where_a_format_has_none(tmp_path: Path) -> None:
+    for kind in (McapCopy, BagCopy):
+        copy = kind(tmp_path / "run", "run")
+        with pytest.raises(CannotWriteError, match="no time before 1970"):
+            copy.write(TF_CHANNEL, -1, PAYLOAD)
+        # 1970 begins with 0.
+        copy.write(TF_CHANNEL, 0, PAYLOAD)
+        copy.close()
+
+
+def test_transforms_get_a_channel_in_the_encoding_of_the_copy() -> None:
+    assert transform_channel(TF_CHANNEL, "cdr", {"a": "b"}).type == "tf2_msgs/msg/TFMessage"
+    ros1 = transform_channel(TF_CHANNEL, "ros1", {})
+    assert (ros1.topic, ros1.type, ros1.encoding) == ("/tf", "tf2_msgs/TFMessage", "ros1")
+
+
+def test_a_copy_holds_transforms_in_its_own_encoding(tmp_path: Path) -> None:
+    pytest.importorskip("foxglove")
+    ros1, json_ = Channel("/tf", "tf2_msgs/TFMessage", "ros1"), Channel("/tf", FRAME_TRANSFORMS, "json")
+    foxglove, other = (Channel("/tf", kind, "protobuf") for kind in (FRAME_TRANSFORMS, "foxglove.FrameTransform"))
+    channels = (TF_CHANNEL, ros1, json_, foxglove, other)
+    for kind, held in ((McapCopy, channels), (BagCopy, [ros1]), (SqliteCopy, [TF_CHANNEL]), (FoxgloveCopy, [foxglove])):
+        copy = kind(tmp_path / "run", "run")
+        assert [channel for channel in channels if copy.holds(channel)] == list(held)
+        copy.close()
+
+
+def test_without_the_extra_a_copy_in_foxglove_s_schema_makes_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove.messages", None)
+    with pytest.raises(ImportError):
+        FoxgloveCopy(tmp_path / "run", "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_definition_of_a_type_stays_where_it_is_one_of_ros_2(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    copy = SqliteCopy(path, "run.db3")
+    for kind, encoding in (("a/msg/A", "ros2msg"), ("b/msg/B", "ros2idl"), ("c/msg/C", "")):
+        copy.write(Channel(f"/{kind}", kind, "cdr", encoding, b"int8 x"), 1, b"")
+    copy.write(Channel("/tf", TF_CHANNEL.type, "cdr", "ros2msg", b"int8 y"), 1, b"")
+    copy.finish()
+    with closing(sqlite3.connect(path)) as file:
+        found = file.execute("SELECT * FROM message_definitions ORDER BY id").fetchall()
+    assert found == [(1, "a/msg/A", "ros2msg", "int8 x", ""), (2, TF_CHANNEL.type, "ros2msg", "int8 y", TYPE_HASH)]
+
+
+def test_a_bag_is_latching_where_transforms_are_static(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    copy = BagCopy(path, "run.bag")
+    for topic in ("/tf", "/tf_static"):
+        copy.write(Channel(topic, TF_CHANNEL.type, "cdr"), 1, PAYLOAD)
+    copy.finish()
+    with Reader(path) as bag:
+        # As a publisher of ROS 1 says it: not at all, or 1.
+        found = {each.topic: getattr(each.ext, "latching", "") for each in bag.connections}
+    assert found == {"/tf": None, "/tf_static": 1}
+
+
+@pytest.mark.parametrize(
+    ("times", "start", "duration"),
+    [([], 0, 0), ([0], 0, 0), ([7, 5, 9], 5, 4), ([-9, -5, -7], -9, 4)],
+)
+def test_the_metadata_have_the_first_time_and_the_duration(
+    tmp_path: Path, times: list[int], start: int, duration: int
+) -> None:
+    path = tmp_path / "run.db3"
+    copy = SqliteCopy(path, "run.db3")
+    for time in times:
+        copy.write(TF_CHANNEL, time, PAYLOAD)
+    copy.finish()
+    with closing(sqlite3.connect(path)) as file:
+        ((text,),) = file.execute("SELECT metadata FROM metadata")
+    metadata = json.loads(text)["rosbag2_bagfile_information"]
+    (of_file,) = metadata["files"]
+    for each in (metadata, of_file):
+        assert each["starting_time"] == {"nanoseconds_since_epoch": start}
+        assert each["duration"] == {"nanoseconds": duration}
+        assert each["message_count"] == len(times)
+    assert [topic["message_count"] for topic in metadata["topics_with_message_count"]] == [len(times)] * bool(times)
+
+
+def test_the_metadata_have_the_hash_of_a_type_where_it_is_known(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    copy = SqliteCopy(path, "run.db3")
+    copy.write(TF_CHANNEL, 1, PAYLOAD)
+    copy.write(Channel("/talk", "std_msgs/msg/String", "cdr"), 2, b"")
+    copy.finish()
+    with closing(sqlite3.connect(path)) as file:
+        (metadata,) = file.execute("SELECT metadata FROM metadata").fetchone()
+        columns = dict(file.execute("SELECT name, type_description_hash FROM topics"))
+        assert [number for (number,) in file.execute("SELECT id FROM topics ORDER BY id")] == [1, 2]
+        ((version,),) = file.execute("SELECT metadata_version FROM metadata")
+    assert json.loads(metadata)["rosbag2_bagfile_information"]["version"] == version
+    topics = json.loads(metadata)["rosbag2_bagfile_information"]["topics_with_message_count"]
+    told = {topic["topic_metadata"]["name"]: topic["topic_metadata"]["type_description_hash"] for topic in topics}
+    assert told == columns == {"/tf": TYPE_HASH, "/talk": ""}
+
+
+@pytest.mark.parametrize(("kind", "name"), [("a/B", "a/msg/B"), ("a/msg/B", "a/msg/B")])
+def test_types_have_the_names_of_ros_2(kind: str, name: str) -> None:
+    assert MessageTypes.name(kind) == name
+    with pytest.raises(ValueError, match="no name of a type"):
+        MessageTypes.name("B")
+
+
+def test_a_type_that_the_file_defines_is_converted() -> None:
+    cdr = Channel("/a", "my_msgs/msg/Pair", "cdr", "ros2msg", b"uint8 a\nuint32 b\n")
+    ros1 = Channel("/a", "my_msgs/Pair", "ros1", "ros1msg", b"uint8 a\nuint32 b\n")
+    payload = b"\0\1\0\0\7\0\0\0\5\0\0\0"
+    assert MessageTypes().convert(cdr, payload) == b"\7\5\0\0\0"
+    assert MessageTypes().convert(ros1, b"\7\5\0\0\0") == payload
+    definition, digest = MessageTypes().ros1_definition(cdr)
+    assert "uint32 b" in definition
+    assert len(digest) == 32
+
+
+def test_what_is_not_known_or_damaged_is_an_error() -> None:
+    unknown = Channel("/a", "my_msgs/msg/Pair", "cdr")
+    types = MessageTypes()
+    with pytest.raises(ValueError, match="cannot be converted"):
+        types.convert(unknown, b"\0\1\0\0")
+    with pytest.raises(ValueError, match="has no definition"):
+        types.ros1_definition(unknown)
+    damaged = Channel("/a", "my_msgs/msg/Pair", "cdr", "ros2msg", b"\xff{{")
+    with pytest.raises(ValueError, match="cannot be read"):
+        types.convert(damaged, b"")
+    # Told once, and then it is a type without a definition.
+    with pytest.raises(ValueError, match="cannot be converted"):
+        types.convert(damaged, b"")
+
+
+def test_the_errors_of_long_names_are_cut() -> None:
+    for schema in (b"", b"\xff{{"):
+        channel = Channel("/a", "my_msgs/msg/" + "x" * 300, "cdr", "ros2msg", schema)
+        for call in (lambda channel: MessageTypes().convert(channel, b""), MessageTypes().ros1_definition):
+            with pytest.raises(ValueError, match="x" * 99) as raised:
+                call(channel)
+            assert len(str(raised.value)) == 200
+
+
+def test_a_definition_of_ros_1_is_passed_on_with_its_digest() -> None:
+    own = Channel("/a", "my_msgs/Pair", "ros1", "ros1msg", b"uint8 a\n", {"md5sum": "1234"})
+    assert MessageTypes().ros1_definition(own) == ("uint8 a\n", "1234")
+    # Without one, it is that of the definition: the MD5 sum of its text, by ROS.
+    other = Channel("/a", "my_msgs/Pair", "ros1", "ros1msg", b"uint8 a\n")
+    assert MessageTypes().ros1_definition(other) == ("uint8 a\n", md5(b"uint8 a").hexdigest())
+
+
+@pytest.mark.parametrize(
+    ("kind", "digest"),
+    [
+        ("std_msgs/msg/String", "992ce8a1687cec8c8bd883ec73ca41d1"),
+        ("std_msgs/msg/Header", "2176decaecbce78abc3b96ef049fabed"),
+        ("geometry_msgs/msg/PointStamped", "c63aecb41bfdfd6b7e1fac37c7cbe7bf"),
+        ("nav_msgs/msg/Odometry", "cd5e73d190d741a2f92e81eda573aca7"),
+        ("tf2_msgs/msg/TFMessage", "94810edda583a504dfda3829e70d7eec"),
+    ],
+)
+def test_the_definition_of_a_type_of_ros_2_has_the_digest_of_ros_1(kind: str, digest: str) -> None:
+    definition, found = MessageTypes().ros1_definition(Channel("/a", kind, "cdr"))
+    assert found == digest
+    # A header counts the messages there, which ROS 2 has given up.
+    assert ("uint32 seq\ntime stamp\nstring frame_id\n" in definition) == (kind != "std_msgs/msg/String")
+
+
+def test_types_with_a_header_are_known() -> None:
+    assert "sensor_msgs/msg/LaserScan" in types_with_header()
+    assert "geometry_msgs/msg/Twist" not in types_with_header()
+
+
+CHANNEL = foxglove_channel(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"), {})
+
+numbers = st.lists(st.floats(), min_size=7, max_size=7).map(lambda values: struct.pack("<7d", *values))
+foxglove_names = st.text(CHARACTERS, max_size=200).filter(lambda text: text.isprintable()).map(str.encode)
+foxglove_transforms = st.builds(
+    RawTransform, st.integers(-(2**31), 2**40), st.integers(0, 2**31 - 1), foxglove_names, foxglove_names, numbers
+)
+
+
+@given(transforms=st.lists(foxglove_transforms, max_size=4))
+def test_what_foxglove_s_writer_writes_is_what_the_parser_reads(transforms: list[RawTransform]) -> None:
+    assert parser_of(CHANNEL)(write_protobuf(transforms)) == transforms
+
+
+def test_the_bytes_are_those_of_foxglove_s_own_encoder() -> None:
+    theirs = FrameTransforms(
+        transforms=[
+            FrameTransform(
+                timestamp=Timestamp(1_700_000_000, 300),
+                parent_frame_id="map",
+                child_frame_id="base",
+                translation=Vector3(x=1.0, y=-2.0, z=0.1),
+                rotation=Quaternion(x=0.1, y=0.2, z=0.3, w=0.9),
+            )
+        ]
+    ).encode()
+    ours = RawTransform(1_700_000_000, 300, b"map", b"base", struct.pack("<7d", 1.0, -2.0, 0.1, 0.1, 0.2, 0.3, 0.9))
+    assert write_protobuf([ours]) == theirs
+
+
+def test_a_name_that_is_no_text_is_refused() -> None:
+    with pytest.raises(MalformedMessageError, match="UTF-8"):
+        write_protobuf([RawTransform(0, 0, b"map", b"\xff", bytes(56))])
+
+
+def test_the_seconds_that_a_stamp_of_foxglove_holds_are_written() -> None:
+    for seconds in (-(2**63), -1, 2**63 - 1):
+        edge = RawTransform(seconds, 0, b"map", b"base", bytes(56))
+        assert parser_of(CHANNEL)(write_protobuf([edge])) == [edge]
+    # A negative number has ten bytes, as one of 64 bits in two's complement.
+    before = RawTransform(-1, 0, b"map", b"base", bytes(56))
+    assert b"\x08" + b"\xff" * 9 + b"\x01\x10" in write_protobuf([before])
+    for seconds in (-(2**63) - 1, 2**63):
+        with pytest.raises(MalformedMessageError, match=f"{seconds} s does not fit the stamp") as raised:
+            write_protobuf([RawTransform(seconds, 0, b"map", b"base", bytes(56))])
+        assert raised.value.reason == "stamp"

@@ -1,3 +1,5 @@
+"""Which files are recordings, which topics of them are read, and what is told about the rest."""
+
 import errno
 import gzip
 import math
@@ -8,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.writer import Writer
@@ -18,7 +21,9 @@ from support.recorded import SMALL, as_ros2, messages_in, without_unfinished, wr
 from support.samples import moving, static
 
 from tfbus import InvalidTransformError, RecordingError
-from tfbus.recording import RecordedTopic, open_recording
+from tfbus.recording import RecordedMessage, RecordedTopic, open_recording
+from tfbus.recording.formats.storage import Channel
+from tfbus.recording.recording import Block, Choice, DecodedBlock, Selection, looks_like_transforms
 from tfbus.tf_message import encode
 
 SECOND = 1_000_000_000
@@ -301,3 +306,115 @@ def test_the_number_of_messages_of_a_topic_is_not_known_if_one_of_its_files_does
         assert len(without_unfinished(messages)) == 1
         # Now both have been read.
         assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", 2)]
+
+
+TF = "tf2_msgs/msg/TFMessage"
+
+
+def tf(topic: str, kind: str = TF, encoding: str = "cdr") -> Channel:
+    return Channel(topic, kind, encoding)
+
+
+@pytest.mark.parametrize("kind", [TF, "tf2_msgs/TFMessage", "tf/tfMessage", "tf/msg/tfMessage"])
+@pytest.mark.parametrize(
+    ("topic", "static"), [("/tf", False), ("tf", False), ("/tf_static", True), ("tf_static", True)]
+)
+def test_by_default_two_topics_are_read_under_the_names_of_four_types(kind: str, topic: str, static: bool) -> None:
+    assert Selection().choose(tf(topic, kind)) == Choice(static, "")
+    assert Selection(prefix="r/").choose(tf(topic, kind)) == Choice(static, "r/")
+
+
+@pytest.mark.parametrize("topic", ["/robot1/tf", "/TF", "/tf/", "//tf", "", "/", "/tf_stat", "/my_tf"])
+def test_by_default_other_topics_are_not_read(topic: str) -> None:
+    assert Selection().choose(tf(topic)) is None
+
+
+@pytest.mark.parametrize(
+    "channel",
+    [
+        tf("/tf", ""),
+        tf("/tf", "geometry_msgs/msg/TransformStamped"),
+        tf("/tf", "tf2_msgs/msg/tfmessage"),
+        tf("/tf", TF, "protobuf"),
+        tf("/tf", "foxglove.FrameTransform", "cbor"),
+    ],
+)
+def test_other_types_and_encodings_are_not_read_and_are_mentioned(channel: Channel) -> None:
+    assert Selection().choose(channel) is None
+    assert looks_like_transforms(channel)
+
+
+@pytest.mark.parametrize("kind", ["foxglove.FrameTransforms", "foxglove_msgs/msg/FrameTransform"])
+def test_foxglove_transforms_are_read_from_any_topic_that_is_no_tf_of_a_namespace(kind: str) -> None:
+    encoding = "cdr" if "/" in kind else "protobuf"
+    for topic in ("/tf", "/transforms", "/robot1/transforms"):
+        assert Selection().choose(tf(topic, kind, encoding)) == Choice(False, "")
+    assert Selection().choose(tf("/robot1/tf", kind, encoding)) is None
+
+
+def test_topics_are_chosen_with_prefixes_or_without() -> None:
+    for topics in ("/robot1/tf", ["robot1/tf"], {"/robot1/tf": ""}):
+        assert Selection(topics).choose(tf("/robot1/tf")) == Choice(False, "")
+        assert Selection(topics).choose(tf("/tf")) is None
+    both = Selection({"/robot1/tf": "r1/", "/fixed_static": "f/"}, prefix="fleet/")
+    assert both.choose(tf("robot1/tf")) == Choice(False, "fleet/r1/")
+    assert both.choose(tf("/fixed_static")) == Choice(True, "fleet/f/")
+    assert both.topics == ["robot1/tf", "fixed_static"]
+    assert Selection().topics == []
+
+
+def test_namespaces_give_their_prefixes() -> None:
+    everything = Selection(namespaces=True, prefix="x/")
+    assert everything.choose(tf("/tf")) == Choice(False, "x/")
+    assert everything.choose(tf("/robot1/tf")) == Choice(False, "x/robot1/")
+    assert everything.choose(tf("/a/b/tf_static")) == Choice(True, "x/a/b/")
+    assert everything.choose(tf("/my_tf")) is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        ({"topics": ["/tf"], "namespaces": True}, ValueError),
+        ({"prefix": "/r"}, ValueError),
+        ({"topics": {"/tf": "/r"}}, ValueError),
+        ({"topics": [3]}, TypeError),
+        ({"topics": {"/tf": 3}}, TypeError),
+    ],
+)
+def test_wrong_choices_are_refused(arguments: dict[str, Any], error: type[Exception]) -> None:
+    with pytest.raises(error):
+        Selection(**arguments)
+
+
+def test_only_what_may_be_transforms_looks_like_them() -> None:
+    assert looks_like_transforms(tf("/robot1/tf", "std_msgs/msg/String"))
+    assert looks_like_transforms(tf("/x"))
+    assert not looks_like_transforms(tf("/x", "std_msgs/msg/String"))
+
+
+def test_blocks_have_all_messages_decoded_at_once_or_one_by_one(tmp_path: Path) -> None:
+    lines = [(k, "/tf", [moving("map", "base", k)]) for k in range(1_000)]
+    with open_recording(write_mcap(tmp_path / "run.mcap", lines, chunk_size=70_000)) as recording:
+        blocks = list(recording.blocks())
+        assert len(blocks) == 2
+        assert sum(map(len, blocks)) == 1_000
+        for block in blocks:
+            columns = block.columns()
+            assert columns is not None
+            assert [each.stamps.tolist() for each in columns] == [[each.batch[0].stamp for each in block.messages()]]
+
+
+def test_the_static_transforms_from_before_are_a_block_of_their_own(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf_static", [static("a", "b")]), (5, "/tf", [moving("b", "c", 5)])])
+    with open_recording(path) as recording:
+        latched, rest = recording.blocks(since=3)
+    assert isinstance(latched, DecodedBlock)
+    assert isinstance(rest, Block)
+    assert len(latched) == 1
+    assert list(latched.messages()) == [RecordedMessage(3, (static("a", "b"),), ())]
+
+
+def test_messages_that_are_not_counted_yet_add_nothing_to_the_progress() -> None:
+    message = RecordedMessage(3, (static("a", "b"),), ())
+    block = DecodedBlock(iter([message]))
+    assert (len(block), list(block.messages())) == (0, [message])

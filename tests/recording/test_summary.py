@@ -1,23 +1,39 @@
+"""What a recording holds in numbers, and what is suspicious in it."""
+
 import dataclasses
 import pickle
+import struct
+from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
-from support.recorded import SMALL, WRONG_IN_SMALL, messages_in, real, write_mcap
+from support.allocations import peak_of
+from support.recorded import SMALL, WRONG_IN_SMALL, Line, messages_in, real, write_mcap
 from support.samples import any_samples, moving, static
 
-from tfbus import TransformStamped
-from tfbus.recording import FrameSummary, RecordedMessage, RecordingSummary, load, open_recording, summarise
+from tfbus import SECOND, TransformStamped
+from tfbus.recording import (
+    FrameSummary,
+    RecordedMessage,
+    RecordingSummary,
+    examine,
+    load,
+    open_recording,
+    summarise,
+    summary,
+)
 from tfbus.recording.formats import mcap
 from tfbus.recording.formats.mcap_output import McapOutput
+from tfbus.recording.summary import _SINGLE, Durations, Periods
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
+from tfbus.tf_message import encode
 
-SECOND = 1_000_000_000
 MS = 1_000_000
 
 
@@ -247,3 +263,141 @@ def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(tmp_path
     assert b.delay.max == 0.015
     senders = {sender.authority: (sender.frames, sender.moving) for sender in summary.senders}
     assert senders == {"one": (("b",), 4_000), "two": (("b",), 1), "three": (("c",), 1)}
+
+
+delays = st.lists(st.integers(-(10**15), 10**15), min_size=1, max_size=300)
+
+
+@given(parts=st.lists(delays, min_size=1, max_size=3), singles=st.lists(st.integers(-(10**15), 10**15), max_size=3))
+def test_mean_and_maximum_are_exact_and_the_quantile_is_within_1_percent(
+    parts: list[list[int]], singles: list[int]
+) -> None:
+    counted = []
+    for part in parts:
+        each = Durations()
+        each.add(np.array(part))
+        for duration in singles:
+            each.add_one(duration)
+        part += singles
+        counted.append(each)
+    spread = Durations.joined(counted).spread()
+    assert spread is not None
+    whole = sorted(delay for part in parts for delay in part)
+    assert spread.mean == pytest.approx(sum(whole) / len(whole) / SECOND, rel=1e-9, abs=1e-9)
+    assert spread.max == whole[-1] / SECOND
+    exact = whole[-(-99 * len(whole) // 100) - 1] / SECOND
+    assert spread.p99 == pytest.approx(exact, rel=0.0101, abs=1e-12)
+    assert spread.p99 <= spread.max
+
+
+def test_two_of_two_hundred_are_beyond_the_quantile_and_three_are_not() -> None:
+    for late, p99 in ((2, 1.0), (3, 100.0)):
+        durations = Durations()
+        durations.add(np.array([SECOND] * (200 - late) + [100 * SECOND] * late))
+        spread = durations.spread()
+        assert spread is not None
+        # 99 % do not exceed it, so it is rounded up.
+        assert p99 <= spread.p99 <= p99 * 1.0101
+        assert spread.max == 100.0
+
+
+def test_zero_is_exact_and_nothing_has_no_spread() -> None:
+    zero = Durations()
+    zero.add(np.zeros(3, np.int64))
+    spread = zero.spread()
+    assert spread is not None
+    assert (spread.mean, spread.p99, spread.max) == (0.0, 0.0, 0.0)
+    assert Durations().spread() is None
+
+
+@pytest.mark.parametrize("at_once", [1, _SINGLE - 1])
+def test_durations_that_come_in_few_take_no_more_memory_the_more_there_are(at_once: int) -> None:
+    durations = Durations()
+
+    def count() -> None:
+        for _ in range(30 * _SINGLE // at_once):
+            if at_once == 1:
+                durations.add_one(7)
+            else:
+                durations.add(np.full(at_once, 7))
+
+    # Half of what they would take, at 8 bytes each.
+    assert peak_of(count) < 30 * _SINGLE * 8 / 2
+
+
+@pytest.mark.parametrize("at_once", [1, 7, _SINGLE - 1, _SINGLE, _SINGLE + 1, 2_500])
+def test_thousands_are_all_counted_however_many_come_at_once(at_once: int) -> None:
+    durations = Durations()
+    whole = SECOND * np.arange(1, 2_501)
+    for begin in range(0, 2_500, at_once):
+        if at_once == 1:
+            durations.add_one(int(whole[begin]))
+        else:
+            durations.add(whole[begin : begin + at_once])
+    spread = durations.spread()
+    assert spread is not None
+    assert (spread.mean, spread.max) == (1_250.5, 2_500.0)
+    assert 2_475.0 <= spread.p99 <= 2_475.0 * 1.0101
+
+
+columns = st.lists(st.lists(st.integers(0, 10**4), max_size=60), max_size=4)
+
+
+@given(columns=columns, at_once=st.sampled_from([1, 7, 10**6]))
+@example(columns=[], at_once=1)
+@example(columns=[[5], [], [5, 5]], at_once=1)
+@example(columns=[[5], [7, 7]], at_once=1)
+@example(columns=[[9, 3, 6], [0, 3, 1]], at_once=1)
+@example(columns=[[3, 0], [9, 12, 10]], at_once=10**6)
+def test_the_periods_are_those_of_all_different_stamps(columns: list[list[int]], at_once: int) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(summary, "_AT_ONCE", at_once)
+        periods = Periods([array("q", [stamp * SECOND for stamp in column]) for column in columns])
+    stamps = sorted({stamp for column in columns for stamp in column})
+    differences = np.diff(stamps)
+    assert periods.oldest == (stamps[0] * SECOND if stamps else None)
+    assert periods.newest == (stamps[-1] * SECOND if stamps else None)
+    spread = periods.spread()
+    if len(stamps) < 2:
+        assert (periods.rate, periods.longest, spread) == (None, None, None)
+        return
+    assert spread is not None
+    assert periods.rate == pytest.approx(1 / differences.mean())
+    assert periods.longest == spread.max == differences.max()
+    assert spread.mean == pytest.approx(differences.mean(), rel=1e-12)
+    assert spread.p99 == pytest.approx(sorted(differences)[-(-99 * len(differences) // 100) - 1], rel=0.0101)
+
+
+def test_the_stamps_stay_in_their_arrays_sorted() -> None:
+    stamps = array("q", [3, 1, 2])
+    Periods([stamps])
+    stamps.append(9)
+    assert list(stamps) == [1, 2, 3, 9]
+
+
+def test_a_recording_is_examined_as_it_arrived_with_the_norms_as_they_were_sent(tmp_path: Path) -> None:
+    uneven = bytearray(encode([moving("odom", "base", 3 * SECOND)]))
+    uneven[-8:] = struct.pack("<d", 1.005)
+    lines: list[Line] = [
+        *((k * SECOND, "/tf", [moving("odom", "base", k * SECOND)]) for k in range(3)),
+        (3 * SECOND, "/tf", bytes(uneven)),
+        (4 * SECOND, "/tf", [moving("odom", "base", 2 * SECOND)]),
+        (5 * SECOND, "/tf", b"nonsense"),
+    ]
+    blocks: list[int] = []
+    with open_recording(write_mcap(tmp_path / "run.mcap", lines)) as recording:
+        found = [
+            (each.kind, each.frame, each.count, each.first, each.worst)
+            for each in examine(recording, progress=blocks.append)
+        ]
+        late = [each.kind for each in examine(recording, since=4 * SECOND, until=4 * SECOND)]
+    assert found[0][:3] == ("refused", None, 1)
+    assert [each[:4] for each in found[1:3]] == [
+        ("stamps go back", "base", 1, 2 * SECOND),
+        ("duplicate stamps", "base", 1, 2 * SECOND),
+    ]
+    kind, _, count, first, worst = found[3]
+    assert (kind, count, first) == ("rotation", 1, 3 * SECOND)
+    assert worst is not None
+    assert abs(worst - 0.005) < 1e-12
+    assert (sum(blocks), late) == (6, [])

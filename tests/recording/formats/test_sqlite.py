@@ -1,3 +1,5 @@
+"""Files of SQLite, as ROS 2 records them, whole and harmed."""
+
 import shutil
 import sqlite3
 import struct

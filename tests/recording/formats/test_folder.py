@@ -1,3 +1,5 @@
+"""Folders of ROS 2: several files, compression, and what the metadata promise."""
+
 import os
 import shutil
 from pathlib import Path

@@ -1,17 +1,28 @@
+"""MCAP files of every layout, whole and harmed, and their records byte by byte."""
+
 import os
 import random
+import struct
 import tracemalloc
+import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
+from io import BytesIO
+from itertools import accumulate, cycle, islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import zstandard
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import ChunkIndex, McapRecord
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
 from support.recorded import batches_in, facts, messages_in, without_unfinished, write_mcap
@@ -20,6 +31,17 @@ from support.samples import moving, static
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import RecordedMessage, open_recording
 from tfbus.recording.formats import mcap, mcap_records
+from tfbus.recording.formats.mcap import _FIRST_STEPS, ChunkPacker, McapStorage, OpenChunk, record_places
+from tfbus.recording.formats.mcap_records import (
+    DAMAGE,
+    Chunk,
+    parse_record,
+    read_records,
+    scan_chunks,
+    split_chunk,
+    split_message,
+)
+from tfbus.recording.formats.storage import Channel, ChunkPlace, Packed, UnfoldError
 from tfbus.stamps import STAMP_MAX
 from tfbus.tf_message import encode
 
@@ -643,3 +665,352 @@ def test_one_flipped_bit_never_loses_a_message_in_silence(
         told = recording.remarks or not recording.finished
     read = sum(bool(message.batch) for message in messages)
     assert read == 15 or told or any(message.errors for message in messages)
+
+
+def message(number: int, received: int, payload: bytes) -> bytes:
+    content = struct.pack("<HIQQ", number, 0, received, 0) + payload
+    return struct.pack("<BQ", 5, len(content)) + content
+
+
+CHANNELS = {0: Channel("/tf", "a", "cdr"), 3: Channel("/tf", "b", "cdr")}
+
+
+def packed(*contents: bytes, low: int = 0, high: int = 100) -> tuple[list[tuple[int, str, bytes]], Counter[int]]:
+    """Log time, kind of channel or damage, and payload of the messages in some chunks; and the number of all."""
+    counts: Counter[int] = Counter()
+    chunks = [OpenChunk(ChunkPlace(5, 9, at), content) for at, content in enumerate(contents)]
+    found = []
+    for block in ChunkPacker(CHANNELS.get, lambda _: None, counts.update).pack(chunks, low, high):
+        damaged = not isinstance(block, Packed) and any(not isinstance(channel, Channel) for _, channel, _ in block)
+        assert isinstance(block, Packed) != damaged
+        for received, channel, payload in block.stored() if isinstance(block, Packed) else block:
+            found.append((received, channel.type if isinstance(channel, Channel) else channel.detail, payload))
+    return found, counts
+
+
+def test_all_messages_are_counted_and_those_of_wanted_channels_are_packed_by_time() -> None:
+    first, second = message(3, 7, b"x") + message(8, 1, b""), message(0, 5, b"y") + message(3, 6, b"z")
+    expected = [(5, "a", b"y"), (6, "b", b"z"), (7, "b", b"x")]
+    assert packed(first, second) == (expected, {0: 1, 3: 2, 8: 1})
+    # Of a part, both ends belong to it, and all are counted.
+    assert packed(first, second, low=6, high=7) == (expected[1:], {0: 1, 3: 2, 8: 1})
+    assert packed(first, second, low=6, high=6) == (expected[1:2], {0: 1, 3: 2, 8: 1})
+    # Also if no channel is wanted, or nothing is there.
+    assert packed(message(8, 1, b"")) == ([], {8: 1})
+    assert packed() == packed(b"") == ([], {})
+
+
+@pytest.mark.parametrize(
+    ("damaged", "why"),
+    [
+        (message(3, 6, b"x")[:-1], "a record goes on behind the end of the chunk"),
+        (struct.pack("<BQ", 5, 21) + bytes(40), "a message is too short"),
+        (message(3, 6, b"x") * 3, "it has more than 2 messages, which is the bound"),
+    ],
+)
+def test_the_messages_of_the_good_chunks_are_counted_beside_a_damaged_one(
+    monkeypatch: pytest.MonkeyPatch, damaged: bytes, why: str
+) -> None:
+    for module in ("mcap", "mcap_records"):
+        monkeypatch.setattr(f"tfbus.recording.formats.{module}.MAX_CHUNK_MESSAGES", 2)
+    good = message(3, 7, b"x") + message(8, 1, b"")
+    lost = f"the chunk at byte 1: {why}"
+    assert packed(good, damaged, good) == ([(5, lost, b""), *[(7, "b", b"x")] * 2], {3: 2, 8: 2})
+    assert packed(damaged, low=6) == ([(6, lost.replace("1", "0", 1), b"")], {})
+    # Where nothing is damaged, so many are packed.
+    assert packed(good, good) == ([(7, "b", b"x")] * 2, {3: 2, 8: 2})
+
+
+def test_a_record_that_ends_where_another_chunk_has_begun_is_damage() -> None:
+    good = message(3, 7, b"x")
+    # Together, their bytes are records again.
+    found, counts = packed(good[:20], good[20:])
+    assert [text.partition(":")[0] for _, text, _ in found] == ["the chunk at byte 0", "the chunk at byte 1"]
+    assert counts == {}
+
+
+@pytest.mark.parametrize("wrong", ["schema", "short"])
+def test_a_damaged_chunk_among_packed_ones_is_lost_alone(tmp_path: Path, wrong: str) -> None:
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer: Any = Writer(file, 1, CompressionType.NONE, enable_crcs=False)
+        writer.start("ros2", "")
+        channel = writer.register_channel(
+            "/tf", "cdr", writer.register_schema("tf2_msgs/msg/TFMessage", "ros2msg", b"")
+        )
+        for k in range(5):
+            writer.add_message(channel, k, encode([moving("map", f"frame{k}", k)]), k)
+        writer.finish()
+    data = bytearray(path.read_bytes())
+    at = data.index(b"frame2")
+    head = data.rindex(b"\5", 0, at - 31 - 24)
+    while data[head : head + 1] != b"\5" or int.from_bytes(data[head + 1 : head + 9], "little") > 200:
+        head = data.rindex(b"\5", 0, head)
+    # The record of the third message becomes one that ends too early, or a schema.
+    data[head] = 3 if wrong == "schema" else data[head]
+    if wrong == "short":
+        data[head + 1 : head + 9] = (21).to_bytes(8, "little")
+    path.write_bytes(data)
+    storage = McapStorage(path)
+    try:
+        expected = list(storage.messages(lambda _: True))
+        blocks = list(storage.packed(lambda _: True))
+        found = [stored for block in blocks for stored in (block.stored() if isinstance(block, Packed) else block)]
+    finally:
+        storage.close()
+    assert [(received, payload) for received, _, payload in found] == [
+        (received, payload) for received, _, payload in expected
+    ]
+    assert len([1 for _, each, _ in found if isinstance(each, Channel)]) == 4
+
+
+TF = Channel("/tf", "", "cdr")
+
+
+def split(data: bytes, torn: bool = False) -> tuple[list[tuple[int, object, bytes]], dict[int, int]]:
+    registered: list[McapRecord] = []
+    found, counts = split_chunk(data, {3: TF}.get, registered.append, torn)
+    assert registered == []
+    return list(found), counts
+
+
+def test_messages_of_wanted_channels_are_found_and_all_are_counted() -> None:
+    data = message(3, 10, b"x") + message(4, 11, b"y") + message(3, 12, b"")
+    assert split(data) == ([(10, TF, b"x"), (12, TF, b"")], {3: 2, 4: 1})
+
+
+def test_a_record_that_goes_on_behind_the_end_is_damage_unless_the_chunk_is_torn() -> None:
+    data = message(3, 10, b"x") + message(3, 11, b"y")
+    for size in range(len(data) // 2 + 1, len(data)):
+        with pytest.raises((ValueError, struct.error)):
+            split(data[:size])
+        assert split(data[:size], torn=True) == ([(10, TF, b"x")], {3: 1})
+
+
+def test_a_message_without_its_header_is_damage() -> None:
+    with pytest.raises(ValueError, match="too short"):
+        split(struct.pack("<BQ", 5, 3) + b"abc" + bytes(30))
+    assert split_message(message(3, 10, b"x")[9:]) == (10, 3, b"x")
+
+
+def test_kinds_of_records_from_128_on_are_private_and_others_that_are_unknown_are_told() -> None:
+    kinds = (127, 128, 255)
+    data = b"".join(struct.pack("<BQ", kind, 1) + b"x" for kind in kinds) + struct.pack("<BQ", 2, 0)
+    assert list(read_records(BytesIO(data), len(data))) == [(0, 127, None)]
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def test_records_are_read_up_to_their_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_records, "_BOUND", {Opcode.CHUNK: 5, Opcode.MESSAGE: 4})
+    monkeypatch.setattr(mcap_records, "MAX_INDEX", 3)
+    for opcode, bound in ((Opcode.CHUNK, 5), (Opcode.MESSAGE, 4), (Opcode.SCHEMA, 3), (Opcode.STATISTICS, 3)):
+        within, beyond = bytes(bound), bytes(bound + 1)
+        data = record(opcode, within) + record(opcode, beyond) + record(opcode, b"") + record(Opcode.FOOTER, b"")
+        second = 9 + bound
+        assert list(read_records(BytesIO(data), len(data))) == [
+            (0, opcode, within),
+            (second, opcode, None),
+            (second + 10 + bound, opcode, b""),
+        ]
+
+
+def test_the_part_of_a_record_that_there_is_comes_with_the_end_of_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = record(Opcode.MESSAGE, b"abc")
+    for size, torn in ((12, None), (11, (Opcode.MESSAGE, b"ab")), (9, (Opcode.MESSAGE, b"")), (8, None), (0, None)):
+        found = read_records(BytesIO(data[:size]), size)
+        if size == 12:
+            assert next(found) == (0, Opcode.MESSAGE, b"abc")
+        with pytest.raises(EndOfFile) as raised:
+            next(found)
+        end = () if torn is None else (torn,)
+        assert raised.value.args == end
+        # What a writer has put behind it meanwhile is not read.
+        if size < 12:
+            found = read_records(BytesIO(data + data + bytes(5)), 12 + size)
+            assert next(found) == (0, Opcode.MESSAGE, b"abc")
+            with pytest.raises(EndOfFile) as raised:
+                next(found)
+            assert raised.value.args == end
+    # Of a huge one, no more than of a chunk.
+    monkeypatch.setattr(mcap_records, "MAX_CHUNK", 2)
+    with pytest.raises(EndOfFile) as raised:
+        next(read_records(BytesIO(record(Opcode.MESSAGE, bytes(9))[:-1]), 17))
+    assert raised.value.args == ((Opcode.MESSAGE, bytes(2)),)
+
+
+def test_an_entry_of_the_index_is_parsed_as_by_the_official_reader() -> None:
+    offsets = struct.pack("<HQHQ", 3, 100, 7, 200)
+    content = struct.pack("<QQQQI", 1, 2, 3, 4, len(offsets)) + offsets
+    content += struct.pack("<QI", 5, 4) + b"zstd" + struct.pack("<QQ", 6, 7)
+    found = parse_record(Opcode.CHUNK_INDEX, content)
+    assert found == ChunkIndex.read(ReadDataStream(BytesIO(content)))
+    assert found == ChunkIndex(
+        message_start_time=1,
+        message_end_time=2,
+        chunk_start_offset=3,
+        chunk_length=4,
+        message_index_offsets={3: 100, 7: 200},
+        message_index_length=5,
+        compression="zstd",
+        compressed_size=6,
+        uncompressed_size=7,
+    )
+    for size in range(len(content)):
+        with pytest.raises(DAMAGE):
+            parse_record(Opcode.CHUNK_INDEX, content[:size])
+    assert parse_record(Opcode.METADATA, b"") is None
+
+
+def test_a_channel_is_asked_for_again_behind_a_record_that_may_describe_it() -> None:
+    described = struct.pack("<HHI", 3, 0, 3) + b"/tf" + struct.pack("<II", 0, 0)
+    channels: dict[int, Channel] = {}
+
+    def register(found: McapRecord) -> None:
+        assert (getattr(found, "id", None), getattr(found, "topic", None)) == (3, "/tf")
+        channels[3] = TF
+
+    data = message(3, 10, b"x") + record(Opcode.CHANNEL, described) + message(3, 11, b"y")
+    assert split_chunk(data, channels.get, register) == ([(11, TF, b"y")], {3: 2})
+
+
+def test_a_chunk_holds_wanted_messages_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_records, "MAX_CHUNK_MESSAGES", 2)
+    data = message(3, 10, b"x") + message(4, 11, b"y") + message(3, 12, b"z")
+    assert split(data) == ([(10, TF, b"x"), (12, TF, b"z")], {3: 2, 4: 1})
+    with pytest.raises(ValueError, match="it has more than 2 messages, which is the bound"):
+        split(data + message(3, 13, b""))
+
+
+def test_chunks_are_scanned_as_they_are_split() -> None:
+    described = struct.pack("<HHI", 3, 0, 3) + b"/tf" + struct.pack("<II", 0, 0)
+    parts = [
+        message(3, 10, b"x"),
+        record(Opcode.CHANNEL, described),
+        message(2**16 - 1, 2**64 - 1, b""),
+        message(4, 0, b"yy"),
+    ]
+    data = b"".join(parts)
+    bounds = np.cumsum([0, *map(len, parts)])
+    registered: list[McapRecord] = []
+    numbers, received, starts, ends = scan_chunks(data, bounds[:-1], bounds[1:], registered.append)
+    assert (numbers.tolist(), received.tolist()) == ([3, 2**16 - 1, 4], [10, 2**64 - 1, 0])
+    assert [data[start:end] for start, end in zip(starts.tolist(), ends.tolist(), strict=True)] == [b"x", b"", b"yy"]
+    assert [getattr(each, "topic", None) for each in registered] == ["/tf"]
+    nothing = np.empty(0, np.int64)
+    assert scan_chunks(b"", nothing, nothing, registered.append).numbers.tolist() == []
+    # One byte shorter than its header, and as long.
+    for size, is_whole in ((21, False), (22, True)):
+        one = record(Opcode.MESSAGE, bytes(size))
+        for order in ((one, parts[0]), (parts[0], one)):
+            begins, ends = np.array([0, len(order[0])]), np.cumsum([*map(len, order)])
+            if is_whole:
+                found = scan_chunks(b"".join(order), begins, ends, registered.append)
+                assert found.numbers.tolist() == [0 if each is one else 3 for each in order]
+            else:
+                with pytest.raises(ValueError, match="a message is too short"):
+                    scan_chunks(b"".join(order), begins, ends, registered.append)
+
+
+def chunk(data: bytes, size: int, crc: int = 0, compression: bytes = b"") -> bytes:
+    head = struct.pack("<QQQII", 1, 2, size, crc, len(compression)) + compression
+    return head + struct.pack("<Q", len(data)) + data
+
+
+def test_a_chunk_has_the_size_and_the_checksum_that_it_claims() -> None:
+    assert Chunk.parse(chunk(b"abc", 3)).unfold() == b"abc"
+    for wrong, why in (
+        (chunk(b"abc", 4), "claims 4 bytes, and holds 3"),
+        (chunk(b"abc", 2), "more than 2 bytes"),
+        (chunk(b"abc", 3, crc=1), "checksum"),
+        (chunk(b"abc", 2**40), "is the bound"),
+        (chunk(b"abc", 3, compression=b"rar"), "'rar' is unknown"),
+    ):
+        with pytest.raises(UnfoldError, match=why):
+            Chunk.parse(wrong).unfold()
+    with pytest.raises(ValueError, match="3 bytes are announced, and there are 2"):
+        Chunk.parse(chunk(b"abc", 3)[:-1])
+    assert Chunk.parse(chunk(b"abc", 3)[:-1], torn=True).unfold(torn=True) == b"ab"
+    with pytest.raises(ValueError, match="name of the compression has 33 bytes"):
+        Chunk.parse(chunk(b"", 0, compression=b"x" * 33))
+    assert Chunk.parse(chunk(b"", 0, compression=b"x" * 32)).compression == "x" * 32
+    assert Chunk.parse(chunk(b"abc", 3, 4, b"lz4")) == (1, 2, 3, 4, "lz4", b"abc")
+    # The checksum is that of the whole content.
+    assert Chunk.parse(chunk(b"abc", 3, crc=zlib.crc32(b"abc"))).unfold() == b"abc"
+    assert Chunk.parse(chunk(b"abc", 3, crc=1)[:-1], torn=True).unfold(torn=True) == b"ab"
+
+
+def test_a_chunk_of_the_largest_size_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_records, "MAX_CHUNK", 3)
+    assert Chunk.parse(chunk(b"abc", 3)).unfold() == b"abc"
+    with pytest.raises(UnfoldError, match="it claims 4 bytes, and 3 is the bound"):
+        Chunk.parse(chunk(b"abcd", 4)).unfold()
+
+
+def written(sizes: list[int]) -> bytes:
+    # Contents that look like heads must not be taken for them.
+    return b"".join(struct.pack("<BQ", 5, size) + bytes(size) for size in sizes)
+
+
+@given(
+    st.lists(st.tuples(st.lists(st.integers(0, 5), min_size=1, max_size=5), st.integers(1, 90)), min_size=1, max_size=4)
+)
+@example([([1, 2, 3], 90), ([4], 1), ([1, 2, 3], 90)])
+def test_all_records_are_found_whether_their_lengths_repeat_or_not(parts: list[tuple[list[int], int]]) -> None:
+    sizes = [size for lengths, count in parts for size in islice(cycle(lengths), count)]
+    assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
+
+
+def test_all_records_are_found_wherever_their_lengths_change() -> None:
+    for count in range(70):
+        sizes = [3] * count + [4, 4, 5, 4, 4, 5] + [3, 1] * 20
+        assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
+
+
+@pytest.mark.parametrize(
+    ("lengths", "most"),
+    # Half as many may repeat as are read at once; of the last, 62 have to be, and twice as many are read each time.
+    [
+        ([3], _FIRST_STEPS),
+        ([1, 2, 3, 1, 4], _FIRST_STEPS),
+        ([*range(_FIRST_STEPS // 2)], _FIRST_STEPS),
+        ([*range(30), 7], (1 + 2 + 4) * _FIRST_STEPS),
+    ],
+)
+def test_few_of_many_records_whose_lengths_repeat_are_read_one_by_one(
+    monkeypatch: pytest.MonkeyPatch, lengths: list[int], most: int
+) -> None:
+    read = []
+
+    class Length:
+        def unpack_from(self, data: bytes, at: int) -> tuple[int]:
+            read.append(at)
+            return struct.unpack_from("<Q", data, at)
+
+    monkeypatch.setattr(mcap, "_LENGTH", Length())
+    sizes = list(islice(cycle(lengths), 10_000))
+    assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
+    assert len(read) <= most
+
+
+def test_long_cycles_and_more_records_than_are_guessed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap, "_GUESSED", 100)
+    sizes = list(islice(cycle([*range(30), 7]), 1_000))
+    assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
+
+
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_a_last_record_that_is_cut_off_is_damage(count: int) -> None:
+    data = written([3] * count)
+    for missing in range(1, 12):
+        with pytest.raises((ValueError, struct.error)):
+            record_places(data[:-missing])
+
+
+@pytest.mark.parametrize("size", [2**63, 2**64 - 1, 100])
+def test_a_record_that_claims_more_than_there_is_is_damage(size: int) -> None:
+    for count in (0, 40):
+        with pytest.raises(ValueError, match="behind the end"):
+            record_places(written([3] * count) + struct.pack("<BQ", 5, size) + bytes(90))

@@ -1,0 +1,337 @@
+"""What all formats share: selection, merging, packing and unfolding within bounds."""
+
+import bz2
+import io
+import re
+import tracemalloc
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from random import Random
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+from support.recorded import SMALL, write_mcap
+from support.samples import moving
+
+from tfbus.recording import open_recording
+from tfbus.recording.formats import mcap, storage
+from tfbus.recording.formats.mcap import McapStorage
+from tfbus.recording.formats.storage import (
+    _BLOCK,
+    MIB,
+    Channel,
+    ChunkPlace,
+    Packed,
+    StoredMessage,
+    UnfoldError,
+    batches,
+    blocks_of,
+    in_order,
+    lost_message,
+    max_unpacked,
+    merge_chunks,
+    pack,
+    select,
+    separate,
+    shortfalls,
+    unfold,
+    unfold_file,
+)
+from tfbus.recording.recording import open_storage
+from tfbus.stamps import STAMP_MAX
+
+TF, OTHER, STATIC = Channel("/tf", "", "cdr"), Channel("/tf", "", "cdr"), Channel("/tf_static", "", "cdr")
+BLOCKS: list[list[StoredMessage]] = [[(1, TF, b"a"), (2, STATIC, b"b")], [], [(3, TF, b"c"), (4, TF, b"d")]]
+
+
+def test_a_range_includes_both_ends_and_what_is_in_it_is_counted() -> None:
+    read: Counter[Channel] = Counter()
+    assert [stored[0] for stored in select(BLOCKS, 2, 3, read)] == [2, 3]
+    assert (read[TF], read[STATIC]) == (1, 1)
+    assert [stored[0] for stored in select(BLOCKS, None, None, Counter())] == [1, 2, 3, 4]
+
+
+def test_a_log_time_that_is_no_stamp_is_lost_at_the_time_before() -> None:
+    blocks: list[list[StoredMessage]] = [[(7, TF, b"")], [(2**63, TF, b""), (9, TF, b"")]]
+    _, (received, error, _), (last, _, _) = select(blocks, None, None, Counter())
+    assert (received, last) == (7, 9)
+    assert "has the log time 9223372036854775808 ns" in str(error)
+    # The last stamp is one, also beside a log time that is none.
+    first, second = select([[(STAMP_MAX, TF, b""), (STAMP_MAX + 1, TF, b"")]], None, None, Counter())
+    assert (first, isinstance(second[1], Channel)) == ((STAMP_MAX, TF, b""), False)
+
+
+def test_a_log_time_that_is_no_stamp_is_lost_at_the_start_of_the_range_or_behind_the_messages_of_its_block() -> None:
+    wrong: StoredMessage = (STAMP_MAX + 1, TF, b"")
+    cases: list[tuple[int | None, list[list[StoredMessage]], list[int]]] = [
+        (None, [[wrong]], [0]),
+        (5, [[wrong]], [5]),
+        (None, [[(7, TF, b""), (3, TF, b""), wrong]], [7, 3, 7]),
+        (None, [[(7, TF, b""), (9, TF, b"")], [wrong, (8, TF, b"")]], [7, 9, 9, 8]),
+    ]
+    for since, blocks, times in cases:
+        assert [received for received, _, _ in select(blocks, since, None, Counter())] == times
+
+
+def test_lost_messages_are_counted_by_none_of_the_channels() -> None:
+    read: Counter[Channel] = Counter()
+    assert len(list(select([[(1, TF, b""), lost_message(2, "gone")]], None, None, read))) == 2
+    assert (read[TF], read[OTHER]) == (1, 0)
+
+
+def test_what_is_promised_is_compared_by_topic() -> None:
+    # A flipped bit may turn the number of one channel into that of another one of the topic.
+    assert list(shortfalls(5, {TF: 2, OTHER: 2, STATIC: 1}, Counter({TF: 1, OTHER: 3, STATIC: 1}))) == []
+    ((received, error, payload),) = shortfalls(5, {TF: 2, OTHER: 2, STATIC: 1}, Counter({TF: 1, OTHER: 2, STATIC: 1}))
+    assert (received, payload) == (5, b"")
+    assert "the file promises 4 messages on '/tf', and 3 were found" in str(error)
+
+
+A, B = Channel("/a", "A", "cdr"), Channel("/b", "B", "cdr")
+messages = st.lists(st.tuples(st.integers(0, 50), st.sampled_from([A, B]), st.binary(max_size=9)), max_size=20)
+
+
+def unpacked(blocks: Iterator[storage.Stored]) -> list[StoredMessage]:
+    return [stored for block in blocks for stored in (block.stored() if isinstance(block, Packed) else block)]
+
+
+@given(stored=messages, low=st.integers(0, 30), high=st.integers(20, 60))
+def test_packed_messages_are_those_that_were_packed_in_the_order_of_their_log_times(
+    stored: list[StoredMessage], low: int, high: int
+) -> None:
+    packed = pack(stored)
+    assert packed is not None
+    assert packed.stored() == stored
+    assert packed.size == len(stored)
+    assert sum(packed.counts().values()) == len(stored)
+    expected = sorted((each for each in stored if low <= each[0] <= high), key=lambda each: each[0])
+    assert unpacked(in_order(packed, low, high)) == expected
+
+
+def test_lost_messages_are_not_packed() -> None:
+    assert pack([(1, A, b""), lost_message(2, "gone")]) is None
+
+
+def test_a_log_time_that_is_no_stamp_comes_last_and_one_by_one() -> None:
+    packed = pack([(5, A, b"x"), (3, B, b"y")])
+    assert packed is not None
+    wrong = packed._replace(received=np.array([-1, 3]))
+    assert list(in_order(wrong, 0, 9)) == [[(3, B, b"y"), (2**64 - 1, A, b"x")]]
+
+
+def test_batches_are_bounded_by_number_and_by_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(storage, "BLOCK", 3)
+    monkeypatch.setattr(storage, "BLOCK_BYTES", 10)
+    stored: list[StoredMessage] = [(k, A, bytes(size)) for k, size in enumerate((1, 1, 1, 9, 1, 30, 1))]
+    assert [[len(payload) for _, _, payload in block] for block in batches(iter(stored))] == [
+        [1, 1, 1],
+        [9, 1],
+        [30],
+        [1],
+    ]
+    # Nine bytes do not fill one of ten.
+    stored = [(k, A, bytes(size)) for k, size in enumerate((9, 1, 1))]
+    assert [len(block) for block in batches(iter(stored))] == [2, 1]
+
+
+@pytest.mark.parametrize("together", [1, 2**16])
+@pytest.mark.parametrize("span", [(None, None), (40, 90)])
+def test_a_file_whose_chunks_overlap_is_packed_in_the_order_of_log_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, together: int, span: tuple[int | None, int | None]
+) -> None:
+    monkeypatch.setattr(mcap, "_FIRST_BLOCK", together)
+    monkeypatch.setattr(mcap, "_BLOCK", together)
+    # Each chunk ends behind the beginning of the next one.
+    times = [k + (15 if k % 10 == 9 else 0) for k in range(120)]
+    path = write_mcap(
+        tmp_path / "run.mcap", [(time, "/tf", [moving("map", "base", time)]) for time in times], chunk_size=1_000
+    )
+    storage = McapStorage(path)
+    try:
+        assert len(storage.index) > 3
+        expected = list(storage.messages(lambda _: True, *span))
+        assert [received for received, _, _ in expected] == sorted(received for received, _, _ in expected)
+        assert unpacked(storage.packed(lambda _: True, *span)) == expected
+        assert unpacked(storage.packed(lambda _: False, *span)) == list(storage.messages(lambda _: False, *span))
+        monkeypatch.setattr(mcap, "_MOST_OVERLAPPING", 1)
+        assert unpacked(storage.packed(lambda _: True, *span)) == expected
+    finally:
+        storage.close()
+
+
+def test_storages_that_do_not_pack_give_the_same_messages() -> None:
+    storage = open_storage(SMALL)
+    try:
+        assert unpacked(blocks_of(storage, lambda _: True)) == list(storage.messages(lambda _: True))
+    finally:
+        storage.close()
+
+
+CHANNEL = Channel("/tf", "", "cdr")
+
+
+@given(chunks=st.lists(st.lists(st.integers(0, 20), min_size=1, max_size=5), max_size=8))
+def test_messages_come_by_log_time_and_those_of_one_time_in_the_order_of_the_file(chunks: list[list[int]]) -> None:
+    places = sorted(ChunkPlace(min(times), max(times), offset) for offset, times in enumerate(chunks))
+
+    def read(place: ChunkPlace) -> list[StoredMessage]:
+        return [(time, CHANNEL, b"%d %d" % (place.offset, at)) for at, time in enumerate(chunks[place.offset])]
+
+    found = [stored for block in merge_chunks(places, read) for stored in block]
+    assert found == sorted(
+        (stored for place in sorted(places, key=lambda place: place.offset) for stored in read(place)),
+        key=lambda stored: stored[0],
+    )
+
+
+@pytest.mark.parametrize(
+    ("offsets", "blocks"),
+    # In the order of the file, the messages at 5 of the first chunk come before those of the second.
+    [((1, 2), [(1, [0, 5]), (2, [5, 9])]), ((2, 1), [(1, [0]), (2, [5, 5, 9])])],
+)
+def test_a_message_waits_for_the_next_chunk_only_if_one_of_that_may_come_before(
+    offsets: tuple[int, int], blocks: list[tuple[int, list[int]]]
+) -> None:
+    opened: list[int] = []
+
+    def read(place: ChunkPlace) -> list[StoredMessage]:
+        opened.append(place.offset)
+        return [(place.start, CHANNEL, b""), (place.end, CHANNEL, b"")]
+
+    places = [ChunkPlace(0, 5, offsets[0]), ChunkPlace(5, 9, offsets[1])]
+    found = [(len(opened), [received for received, _, _ in block]) for block in merge_chunks(places, read)]
+    assert found == blocks
+
+
+@pytest.mark.parametrize(
+    ("spans", "parts"),
+    [
+        ([], []),
+        ([(0, 5)], [1]),
+        ([(0, 5), (6, 9)], [1, 1]),
+        ([(0, 5), (5, 9)], [1, 1]),
+        ([(0, 6), (5, 9)], [2]),
+        ([(0, 9), (1, 2), (3, 4), (9, 12), (10, 11), (12, 13)], [3, 2, 1]),
+        ([(0, 0), (0, 0)], [1, 1]),
+    ],
+)
+def test_chunks_that_do_not_overlap_are_parts_of_an_index(spans: list[tuple[int, int]], parts: list[int]) -> None:
+    places = [ChunkPlace(*span, offset) for offset, span in enumerate(spans)]
+    found = separate(places)
+    assert [part.stop - part.start for part in found] == parts
+    assert [place for part in found for place in places[part]] == places
+
+
+def test_chunks_that_touch_are_one_part_where_the_file_has_them_in_another_order() -> None:
+    last = ChunkPlace(20, 21, 0)
+    assert separate([ChunkPlace(0, 5, 1), ChunkPlace(5, 9, 2), last]) == [slice(0, 2), slice(2, 3)]
+    assert separate([ChunkPlace(0, 4, 1), ChunkPlace(5, 9, 2), last]) == [slice(0, 1), slice(1, 2), slice(2, 3)]
+
+
+DATA = bytes(range(256)) * 256
+FOLD: dict[str, Callable[[bytes], bytes]] = {
+    "zstd": zstandard.compress,
+    "lz4": lz4.frame.compress,
+    "bz2": bz2.compress,
+    "": bytes,
+    "none": bytes,
+}
+COMPRESSED = ("zstd", "lz4", "bz2")
+
+
+@pytest.mark.parametrize("kind", FOLD)
+def test_what_was_folded_unfolds_to_the_same_up_to_the_bound(kind: str) -> None:
+    folded = FOLD[kind](DATA)
+    assert unfold(folded, kind, len(DATA)) == DATA
+    with pytest.raises(UnfoldError, match=f"more than {len(DATA) - 1:,} bytes"):
+        unfold(folded, kind, len(DATA) - 1)
+
+
+@pytest.mark.parametrize("kind", FOLD)
+def test_a_bound_of_whole_blocks_is_a_bound_too(kind: str) -> None:
+    data = bytes(2 * _BLOCK)
+    assert unfold(FOLD[kind](data), kind, len(data)) == data
+    with pytest.raises(UnfoldError, match=f"more than {len(data):,} bytes"):
+        unfold(FOLD[kind](data + b"x"), kind, len(data))
+
+
+@pytest.mark.parametrize("kind", COMPRESSED)
+def test_a_torn_part_gives_what_it_unfolds_to(kind: str) -> None:
+    # Random bytes, so that there are several blocks.
+    data = Random(0).randbytes(1_200_000)
+    folded = FOLD[kind](data)
+    part = unfold(folded[: len(folded) * 3 // 4], kind, len(data), torn=True)
+    assert len(data) // 4 < len(part) < len(data)
+    assert data.startswith(part)
+
+
+@pytest.mark.parametrize("kind", ["lz4", "bz2"])
+def test_data_that_end_too_early_are_damage(kind: str) -> None:
+    # Without the last byte, all data are there, but not their end.
+    for missing in (1, 10):
+        with pytest.raises(UnfoldError, match="end too early"):
+            unfold(FOLD[kind](DATA)[:-missing], kind, len(DATA))
+
+
+@pytest.mark.parametrize("kind", COMPRESSED)
+def test_no_more_than_the_bound_is_unfolded(kind: str) -> None:
+    folded = FOLD[kind](bytes(2**23))
+    tracemalloc.start()
+    with pytest.raises(UnfoldError, match="more than 1,000 bytes"):
+        unfold(folded, kind, 1_000)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2**20
+
+
+@pytest.mark.parametrize("kind", COMPRESSED)
+def test_nonsense_and_unknown_compressions_are_damage(kind: str) -> None:
+    with pytest.raises(UnfoldError, match="cannot be decompressed"):
+        unfold(b"\xff" * 100, kind, 1_000)
+    with pytest.raises(UnfoldError, match="the compression 'rar' is unknown"):
+        unfold(DATA, "rar", len(DATA))
+
+
+def test_a_file_unfolds_into_another_up_to_the_bound() -> None:
+    folded, unfolded = zstandard.compress(DATA), io.BytesIO()
+    unfold_file(io.BytesIO(folded), unfolded, len(DATA))
+    assert unfolded.getvalue() == DATA
+    # A file may have several frames, and stays open.
+    source, unfolded = io.BytesIO(folded + folded), io.BytesIO()
+    unfold_file(source, unfolded, 2 * len(DATA))
+    assert unfolded.getvalue() == DATA + DATA
+    assert not source.closed
+    with pytest.raises(UnfoldError, match="which is the bound"):
+        unfold_file(io.BytesIO(folded), io.BytesIO(), len(DATA) - 1)
+    with pytest.raises(UnfoldError, match="cannot be decompressed"):
+        unfold_file(io.BytesIO(b"\xff" * 100), io.BytesIO(), len(DATA))
+
+
+def test_a_small_file_unfolds_to_64_mib_and_a_large_one_to_100_times_its_size() -> None:
+    assert max_unpacked(1) == max_unpacked(64 * MIB // 100) == 64 * MIB
+    assert max_unpacked(MIB) == 100 * MIB
+
+
+def test_the_bounds_are_those_that_open_recording_tells() -> None:
+    text = " ".join((open_recording.__doc__ or "").partition("Notes")[2].split())
+    names = (
+        "MAX_MESSAGE",
+        "MAX_OTHER_MESSAGE",
+        "MAX_METADATA",
+        "MIN_UNPACKED",
+        "MAX_INDEX",
+        "MAX_DESCRIBED",
+        "MAX_OVERLAPPING",
+    )
+    assert [int(number) * 2**20 for number in re.findall(r"(\d+) MiB", text)] == [
+        getattr(storage, name) for name in names
+    ]
+    assert storage.MAX_CHUNK == storage.MAX_OTHER_MESSAGE
+    assert "a million messages" in text
+    assert storage.MAX_CHUNK_MESSAGES == 1_000_000
+    assert f"at most {storage.MAX_FACTOR} times" in text

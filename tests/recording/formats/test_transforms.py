@@ -1,0 +1,584 @@
+"""Messages of transforms in every encoding, decoded one by one and at once."""
+
+import json
+import struct
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+from support.samples import moving, static
+
+from tfbus import TransformStamped
+from tfbus.recording.formats import transforms
+from tfbus.recording.formats.storage import Channel, Packed, StoredMessage, pack
+from tfbus.recording.formats.transforms import (
+    ChannelDecoder,
+    ColumnDecoder,
+    Columns,
+    RawTransform,
+    bounded,
+    holds_transforms,
+    parser_of,
+    write_cdr,
+    write_ros1,
+)
+from tfbus.tf_message import MAX_NAME, MalformedMessageError, encode
+
+NUMBERS = struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1)
+ONE = RawTransform(5, 6, b"map", b"base", NUMBERS)
+TWO = RawTransform(7, 8, b"base", b"camera1", struct.pack("<7d", 4, 5, 6, 0, 0, 1, 0))
+THIRD = RawTransform(9, 10, b"base", b"cam", struct.pack("<7d", 7, 8, 9, 0, 1, 0, 0))
+METADATA = {"tfbus.authorities": '[["odometry", 1], ["slam", 1]]'}
+CDR = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr", metadata=METADATA)
+ROS1 = Channel("/tf", "tf2_msgs/TFMessage", "ros1", metadata={"callerid": "/odometry"})
+AS_JSON = {
+    "timestamp": {"sec": 5, "nsec": 6},
+    "parent_frame_id": "map",
+    "child_frame_id": "base",
+    "translation": {"x": 1, "y": 2.0, "z": 3},
+    "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
+}
+
+
+def foxglove(encoding: str, name: str = "foxglove.FrameTransforms", schema: bytes = b"") -> Channel:
+    return Channel("/tf", name, encoding, encoding, schema)
+
+
+def test_json_of_one_transform_and_of_many_is_read() -> None:
+    assert parser_of(foxglove("json"))(json.dumps({"transforms": [AS_JSON, AS_JSON]}).encode()) == [ONE, ONE]
+    assert parser_of(foxglove("json", "foxglove.FrameTransform"))(json.dumps(AS_JSON).encode()) == [ONE]
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"[", b"[" * 100_000, b"3", b'{"transforms": 3}', b'{"transforms": [{}]}', b"\xff", b"null"]
+)
+def test_other_json_is_malformed(text: bytes) -> None:
+    with pytest.raises(MalformedMessageError):
+        parser_of(foxglove("json"))(text)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"), [(("timestamp", "sec"), 1.5), (("translation", "x"), "1"), (("rotation",), 3)]
+)
+def test_json_with_wrong_values_is_malformed(path: tuple[str, ...], value: object) -> None:
+    content = json.loads(json.dumps(AS_JSON))
+    inner = content
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    with pytest.raises(MalformedMessageError):
+        parser_of(foxglove("json", "foxglove.FrameTransform"))(json.dumps(content).encode())
+
+
+def test_foxglove_messages_of_ros_have_the_layout_of_ros() -> None:
+    many = foxglove("cdr", "foxglove_msgs/msg/FrameTransforms")
+    assert parser_of(many)(write_cdr([ONE])) == [ONE]
+    # A single one begins at the stamp, so its numbers are aligned otherwise.
+    names = b"\4\0\0\0map\0" + b"\5\0\0\0base\0"
+    single = b"\0\1\0\0" + struct.pack("<iI", 5, 6) + names
+    single += bytes(-(len(single) - 4) % 8) + NUMBERS
+    assert parser_of(foxglove("cdr", "foxglove_msgs/msg/FrameTransform"))(single) == [ONE]
+    assert parser_of(many)(write_cdr([ONE]) + bytes(3)) == [ONE]
+    with pytest.raises(MalformedMessageError, match=r": 4 bytes behind the last transform"):
+        parser_of(many)(write_cdr([ONE]) + bytes(4))
+    ros1 = struct.pack("<II", 5, 6) + b"\3\0\0\0map\4\0\0\0base" + NUMBERS
+    assert parser_of(foxglove("ros1", "foxglove_msgs/FrameTransform"))(ros1) == [ONE]
+
+
+def in_ros1(transform: RawTransform) -> bytes:
+    seconds, nanoseconds, parent, child, numbers = transform
+    names = b"".join(struct.pack("<I", len(name)) + name for name in (parent, child))
+    return bytes(4) + struct.pack("<II", seconds, nanoseconds) + names + numbers
+
+
+def test_several_transforms_are_one_message_in_either_encoding() -> None:
+    ros1 = write_ros1([ONE, TWO, THIRD])
+    assert ros1 == b"\3\0\0\0" + in_ros1(ONE) + in_ros1(TWO) + in_ros1(THIRD)
+    assert parser_of(ROS1)(ros1) == [ONE, TWO, THIRD]
+    cdr = write_cdr([ONE, TWO, THIRD])
+    # Each string ends at a multiple of 4: the names at 32, 120 and 204, of which only the last is no multiple of 8.
+    first = struct.pack("<iI", 5, 6) + b"\4\0\0\0map\0" + b"\5\0\0\0base\0\0\0\0" + NUMBERS
+    second = struct.pack("<iI", 7, 8) + b"\5\0\0\0base\0\0\0\0" + b"\x08\0\0\0camera1\0" + TWO.numbers
+    third = struct.pack("<iI", 9, 10) + b"\5\0\0\0base\0\0\0\0" + b"\4\0\0\0cam\0" + bytes(4) + THIRD.numbers
+    assert cdr == b"\0\1\0\0\3\0\0\0" + first + second + third
+    assert parser_of(CDR)(cdr) == [ONE, TWO, THIRD]
+
+
+def test_cdr_is_read_in_either_byte_order_and_in_the_usual_one_bit_for_bit() -> None:
+    swapped = struct.pack(">IiI", 1, 5, 6) + b"\0\0\0\4map\0" + b"\0\0\0\5base\0\0\0\0"
+    swapped += bytes(-len(swapped) % 8) + struct.pack(">7d", 1, 2, 3, 0, 0, 0, 1)
+    assert parser_of(CDR)(b"\0\0\0\0" + swapped) == [ONE]
+    # A signalling NaN.
+    odd = ONE._replace(numbers=bytes.fromhex("010000000000f07f") + NUMBERS[8:])
+    assert parser_of(CDR)(write_cdr([odd])) == [odd]
+
+
+@pytest.mark.parametrize(("channel", "payload"), [(CDR, write_cdr([ONE, TWO])), (ROS1, write_ros1([ONE, TWO]))])
+def test_a_message_that_is_cut_anywhere_is_malformed(channel: Channel, payload: bytes) -> None:
+    reasons = set()
+    for size in range(len(payload)):
+        with pytest.raises(MalformedMessageError) as raised:
+            parser_of(channel)(payload[:size])
+        reasons.add(raised.value.reason)
+    # Of CDR, the header may be cut, or a string may be without its NUL.
+    assert reasons == ({"truncated"} if channel is ROS1 else {"truncated", "encoding", "text"})
+
+
+def test_what_is_behind_a_message_of_ros_1_is_told() -> None:
+    with pytest.raises(MalformedMessageError, match=r"\(oversized\): 1 bytes behind the last transform"):
+        parser_of(ROS1)(write_ros1([ONE]) + bytes(1))
+
+
+@pytest.mark.parametrize(
+    ("write", "channel", "low", "high"), [(write_cdr, CDR, -(2**31), 2**31), (write_ros1, ROS1, 0, 2**32)]
+)
+def test_the_seconds_that_the_stamp_of_an_encoding_holds_are_written(
+    write: Callable[[list[RawTransform]], bytes], channel: Channel, low: int, high: int
+) -> None:
+    for seconds in (low, high - 1):
+        edge = ONE._replace(seconds=seconds)
+        assert parser_of(channel)(write([edge])) == [edge]
+    for seconds in (low - 1, high):
+        with pytest.raises(MalformedMessageError, match=f"{seconds} s does not fit the stamp") as raised:
+            write([ONE._replace(seconds=seconds)])
+        assert raised.value.reason == "stamp"
+
+
+def protobuf_schema() -> tuple[bytes, bytes]:
+    """The definition of ``foxglove.FrameTransforms``, and a message of it."""
+    pb2 = pytest.importorskip("google.protobuf.descriptor_pb2")
+    from google.protobuf import descriptor_pool, message_factory, timestamp_pb2
+
+    file = pb2.FileDescriptorProto(name="frames.proto", package="foxglove", syntax="proto3")
+    file.dependency.append("google/protobuf/timestamp.proto")
+    kind = pb2.FieldDescriptorProto
+    fields: dict[str, list[tuple[str, int, str]]] = {
+        "Vector3": [(axis, kind.TYPE_DOUBLE, "") for axis in "xyz"],
+        "Quaternion": [(axis, kind.TYPE_DOUBLE, "") for axis in "xyzw"],
+        "FrameTransform": [
+            ("timestamp", kind.TYPE_MESSAGE, ".google.protobuf.Timestamp"),
+            ("parent_frame_id", kind.TYPE_STRING, ""),
+            ("child_frame_id", kind.TYPE_STRING, ""),
+            ("translation", kind.TYPE_MESSAGE, ".foxglove.Vector3"),
+            ("rotation", kind.TYPE_MESSAGE, ".foxglove.Quaternion"),
+        ],
+        "FrameTransforms": [("transforms", kind.TYPE_MESSAGE, ".foxglove.FrameTransform")],
+    }
+    for name, parts in fields.items():
+        message = file.message_type.add(name=name)
+        for number, (part, type_, type_name) in enumerate(parts, 1):
+            label = kind.LABEL_REPEATED if part == "transforms" else kind.LABEL_OPTIONAL
+            message.field.add(name=part, number=number, type=type_, type_name=type_name or None, label=label)
+    pool = descriptor_pool.DescriptorPool()
+    timestamp = pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
+    pool.Add(timestamp)
+    pool.Add(file)
+    content = message_factory.GetMessageClass(pool.FindMessageTypeByName("foxglove.FrameTransforms"))()
+    each = content.transforms.add(parent_frame_id="map", child_frame_id="base")
+    each.timestamp.seconds, each.timestamp.nanos = 5, 6
+    each.translation.x, each.translation.y, each.translation.z, each.rotation.w = 1, 2, 3, 1
+    return pb2.FileDescriptorSet(file=[timestamp, file]).SerializeToString(), content.SerializeToString()
+
+
+def test_protobuf_is_read_by_the_schema_in_the_file() -> None:
+    schema, payload = protobuf_schema()
+    assert parser_of(foxglove("protobuf", schema=schema))(payload) == [ONE]
+    for wrong in (foxglove("protobuf"), foxglove("protobuf", schema=b"\xff" * 9)):
+        with pytest.raises(MalformedMessageError):
+            parser_of(wrong)(payload)
+    with pytest.raises(MalformedMessageError):
+        parser_of(foxglove("protobuf", schema=schema))(b"\xff" * 20)
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+@given(payload=st.binary(max_size=200))
+def test_any_bytes_are_transforms_or_malformed(encoding: str, payload: bytes) -> None:
+    try:
+        parser_of(Channel("/tf", "tf2_msgs/msg/TFMessage", encoding))(payload)
+    except MalformedMessageError as error:
+        assert error.reason
+
+
+def test_a_message_in_another_encoding_is_told_by_its_header() -> None:
+    parse = parser_of(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"))
+    with pytest.raises(MalformedMessageError, match=r"its header is 00 07 00 00$"):
+        parse(b"\0\7\0\0\1\2\3\4")
+
+
+def test_of_a_long_text_the_error_shows_the_beginning() -> None:
+    body = struct.pack("<I", 1) + bytes(8) + struct.pack("<I", 50) + b"x" * 50 + bytes(80)
+    with pytest.raises(MalformedMessageError, match=f"the string b'{'x' * 40}' does not end with NUL"):
+        parser_of(CDR)(b"\0\1\0\0" + body)
+    with pytest.raises(MalformedMessageError) as raised:
+        parser_of(foxglove("json"))(b"\xff" * 300)
+    assert len(raised.value.detail) == 200
+
+
+def test_a_message_is_bounded_compressed_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transforms, "MAX_MESSAGE", 300)
+    compress = zstandard.compress
+    assert bounded(bytes(300)) == bounded(compress(bytes(300))) == bytes(300)
+    for payload, reason in (
+        (bytes(301), "oversized"),
+        (compress(bytes(301)), "oversized"),
+        (compress(b"")[:4] + b"\xff" * 30, "encoding"),
+    ):
+        with pytest.raises(MalformedMessageError) as raised:
+            bounded(payload)
+        assert raised.value.reason == reason
+
+
+def test_only_known_types_in_known_encodings_hold_transforms() -> None:
+    assert holds_transforms(Channel("/x", "tf2_msgs/msg/TFMessage", "cdr"))
+    assert not holds_transforms(Channel("/x", "tf2_msgs/msg/TFMessage", "json"))
+    assert holds_transforms(foxglove("json"))
+    assert not holds_transforms(foxglove("cbor"))
+    assert not holds_transforms(Channel("/tf", "std_msgs/msg/String", "cdr"))
+
+
+BY_ODOMETRY = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr", metadata={"tfbus.authorities": '[["odometry", 1]]'})
+SAMPLES = [moving("odom", "base", 3, 1.5, "odometry"), moving("base", "wheel", 4, 2.5, "odometry")]
+PAYLOAD = encode(SAMPLES)
+BY_ROS_1 = bytes(get_typestore(Stores.ROS2_HUMBLE).cdr_to_ros1(PAYLOAD, "tf2_msgs/msg/TFMessage"))
+
+
+@pytest.mark.parametrize(
+    ("channel", "payload"),
+    [(BY_ODOMETRY, PAYLOAD), (BY_ODOMETRY, zstandard.compress(PAYLOAD)), (ROS1, BY_ROS_1)],
+    ids=str,
+)
+def test_the_samples_are_those_that_were_sent_in_whatever_they_are_wrapped(channel: Channel, payload: bytes) -> None:
+    found = ChannelDecoder(channel, static=False).decode(payload)
+    assert (found.samples, found.errors) == (SAMPLES, [])
+
+
+@pytest.mark.parametrize(
+    ("metadata", "authorities"),
+    [
+        ('[["x", 1]]', ["x", "x", "x"]),
+        ('[["x", 2], ["y", 1]]', ["x", "x", "y"]),
+        ('[["x", 1], ["y", 2]]', ["x", "y", "y"]),
+        ('[["x", 2], ["y", 2]]', ["", "", ""]),
+        ('[["x", 1], ["y", 1]]', ["", "", ""]),
+        ('[["x", 3], ["y", 0]]', ["", "", ""]),
+        ("[]", ["", "", ""]),
+    ],
+)
+def test_each_transform_has_the_authority_of_its_run_if_there_are_as_many_as_the_runs_have(
+    metadata: str, authorities: list[str]
+) -> None:
+    channel = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr", metadata={"tfbus.authorities": metadata})
+    decoder = ChannelDecoder(channel, static=True, prefix="r/")
+    samples = [static("map", name) for name in "abc"]
+    found = decoder.decode(encode(samples)).samples
+    assert found == [static("r/map", f"r/{name}", authority=who) for name, who in zip("abc", authorities, strict=True)]
+    assert [decoder.authority_of(place, 3) for place in range(3)] == authorities
+
+
+def test_a_refused_transform_stays_refused_under_a_prefix() -> None:
+    payload = encode([moving("map", "a", 1), moving("map", "b", 1, 12_345.0)])
+    payload = payload.replace(struct.pack("<d", 12_345.0), struct.pack("<d", float("nan")))
+    found = ChannelDecoder(BY_ODOMETRY, static=False, prefix="r/").decode(payload)
+    assert found.samples == [moving("r/map", "r/a", 1, authority="odometry"), None]
+    assert [error.reason for error in found.errors] == ["not finite"]
+
+
+def test_in_the_other_byte_order_every_transform_has_its_authority_too() -> None:
+    # One transform, between frames with names of three letters, stamped 1 s and 2 ns, at x = 1 m.
+    name = b"\0\0\0\4abc\0", b"\0\0\0\4xyz\0"
+    numbers = struct.pack(">7d", 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    one = struct.pack(">iI", 1, 2) + b"".join(name)
+    payload = b"\0\0\0\0" + struct.pack(">I", 2) + one + b"\0" * 4 + numbers + one + numbers
+    found = ChannelDecoder(BY_ODOMETRY, static=False).decode(payload)
+    assert found.samples == [moving("abc", "xyz", 1_000_000_002, 1.0, "odometry")] * 2
+
+
+@pytest.mark.parametrize("channel", [BY_ODOMETRY, ROS1])
+@given(payload=st.binary(max_size=300))
+def test_any_bytes_are_samples_or_malformed(channel: Channel, payload: bytes) -> None:
+    try:
+        ChannelDecoder(channel, static=False).decode(payload)
+    except MalformedMessageError as error:
+        assert error.reason
+
+
+@pytest.mark.parametrize("channel", [BY_ODOMETRY, ROS1])
+@given(data=st.data())
+def test_a_message_that_is_cut_or_turned_over_is_samples_or_malformed(channel: Channel, data: st.DataObject) -> None:
+    payload = bytearray(PAYLOAD if channel is BY_ODOMETRY else BY_ROS_1)
+    payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    end = data.draw(st.integers(0, len(payload)))
+    try:
+        ChannelDecoder(channel, static=False).decode(bytes(payload[:end]))
+    except MalformedMessageError as error:
+        assert error.reason
+
+
+def test_what_only_looks_compressed_is_malformed() -> None:
+    with pytest.raises(MalformedMessageError) as raised:
+        ChannelDecoder(BY_ODOMETRY, static=False).decode(b"\x28\xb5\x2f\xfd" + b"\xff" * 30)
+    assert raised.value.reason == "encoding"
+
+
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+TF = "tf2_msgs/msg/TFMessage"
+OTHER = Channel("/tf", TF, "cdr", metadata={"tfbus.authorities": '[["other", 1]]'})
+
+
+def payload_of(channel: Channel, samples: Sequence[TransformStamped]) -> bytes:
+    data = encode(samples)
+    return bytes(TYPES.cdr_to_ros1(data, TF)) if channel is ROS1 else data
+
+
+def both(
+    stored: list[StoredMessage], prefix: str = ""
+) -> tuple[list[Columns] | None, dict[str, list[TransformStamped]]]:
+    """The samples that are decoded at once, and one by one."""
+    decoders = {channel: ChannelDecoder(channel, static=False, prefix=prefix) for channel in (CDR, ROS1, OTHER)}
+    one_by_one: dict[str, list[TransformStamped]] = {}
+    for _, channel, payload in stored:
+        if isinstance(channel, Channel):
+            for sample in decoders[channel].decode(payload).samples:
+                if sample is not None:
+                    one_by_one.setdefault(sample.child, []).append(sample)
+    return ColumnDecoder(decoders).decode(packed(stored)), one_by_one
+
+
+def packed(stored: Sequence[StoredMessage]) -> Packed:
+    found = pack(stored)
+    assert found is not None
+    return found
+
+
+def samples_in(columns: Columns) -> list[TransformStamped]:
+    found = []
+    for stamp, row in zip(columns.stamps.tolist(), columns.rows.tolist(), strict=True):
+        sample = TransformStamped.__new__(TransformStamped)
+        sample._fields = columns.parent, columns.child, stamp, tuple(row), columns.authority, columns.static
+        found.append(sample)
+    return found
+
+
+numbers = st.floats(-1e8, 1e8, allow_nan=False)
+quaternions = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: sum(x * x for x in q) > 0.1)
+
+
+@st.composite
+def unnormalised(draw: st.DrawFn) -> tuple[float, ...]:
+    """Seven numbers whose quaternion is normalised only nearly."""
+    quaternion = np.array(draw(quaternions))
+    quaternion *= draw(st.sampled_from([1.0, 1.0 + 1e-15, 1.0 + 1e-9, 0.992, 1.009])) / np.linalg.norm(quaternion)
+    return (*draw(st.tuples(numbers, numbers, numbers)), *quaternion.tolist())
+
+
+def raw(names: Sequence[tuple[str, str]], stamp: int, rows: Sequence[tuple[float, ...]]) -> bytes:
+    """A message in CDR whose numbers are as they are given."""
+    data = bytearray(encode([moving(parent, child, stamp) for parent, child in names]))
+    at = 0
+    for row in rows:
+        at = data.index(struct.pack("<7d", 0, 0, 0, 0, 0, 0, 1), at)
+        data[at : at + 56] = struct.pack("<7d", *row)
+    return bytes(data)
+
+
+NAMES = ([("map", "odom"), ("odom", "base")], [("map", "odom")], [("a", "b"), ("b", "c")])
+
+
+@given(
+    lines=st.lists(
+        st.tuples(st.sampled_from([CDR, ROS1]), st.sampled_from(NAMES), st.integers(0, 10**18), unnormalised()),
+        max_size=12,
+    ),
+    prefix=st.sampled_from(["", "r1/"]),
+)
+def test_the_bits_are_those_of_decoding_one_by_one(
+    lines: list[tuple[Channel, list[tuple[str, str]], int, tuple[float, ...]]], prefix: str
+) -> None:
+    stored: list[StoredMessage] = []
+    for at, (channel, names, stamp, row) in enumerate(lines):
+        data = raw(names, stamp, [row] * len(names))
+        stored.append((at, channel, bytes(TYPES.cdr_to_ros1(data, TF)) if channel is ROS1 else data))
+    columns, one_by_one = both(stored, prefix)
+    if columns is None:
+        # A frame has several parents.
+        assert any(len({sample.parent for sample in samples}) > 1 for samples in one_by_one.values())
+        return
+    found = [sample for each in columns for sample in samples_in(each)]
+    for child, samples in one_by_one.items():
+        for authority in {sample.authority for sample in samples}:
+            its = [sample for sample in samples if sample.authority == authority]
+            assert [each for each in found if (each.child, each.authority) == (child, authority)] == its
+    assert len(found) == sum(map(len, one_by_one.values()))
+    for each in columns:
+        assert each.received.tolist() == [stored[at][0] for at in each.order.tolist()]
+        assert each.order.tolist() == sorted(each.order.tolist())
+
+
+GOOD = (1, CDR, encode([moving("map", "odom", 1), moving("odom", "base", 1)]))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        (2, CDR, raw([("map", "odom")], 1, [(float("nan"), 0, 0, 0, 0, 0, 1)])),
+        (2, CDR, raw([("map", "odom")], 1, [(1e10, 0, 0, 0, 0, 0, 1)])),
+        (2, CDR, raw([("map", "odom")], 1, [(0, 0, 0, 0, 0, 0, 1.02)])),
+        (2, CDR, raw([("map", "odom")], 1, [(0, 0, 0, 0, 0, 0, 0)])),
+        (2, CDR, raw([("map", "odom")], 1, [(0, 0, 0, 1e300, 0, 0, 0)])),
+        (2, CDR, raw([("map", "odom")], 1, [(0, 0, 0, float("inf"), 0, 0, 0)])),
+        (2, CDR, encode([moving("map", "odom", 1)])[:-8]),
+        (2, CDR, encode([moving("map", "odom", 1)]) + b"\0"),
+        (2, CDR, b"\0\0\0\0" + encode([])[4:]),
+        (2, CDR, b""),
+        (2, CDR, encode([moving("abc", "abd", 1)]).replace(b"abd", b"abc")),
+        (2, CDR, encode([moving("map", "odom", 1)]).replace(b"odom\0", b"odom!")),
+        (2, CDR, encode([moving("map", "odom", 1)]).replace(b"odom\0", b"od\xffm\0")),
+        (2, CDR, encode([moving("map", "odom", 999_999_999)]).replace(struct.pack("<I", 999_999_999), b"\xff" * 4)),
+        (
+            2,
+            ROS1,
+            payload_of(ROS1, [moving("map", "odom", 0)]).replace(b"\0" * 12, b"\0" * 4 + b"\xff" * 4 + b"\0" * 4),
+        ),
+        (2, CDR, encode([moving("earth", "odom", 2), moving("x", "y", 2)])),
+        (2, Channel("/tf", "foxglove.FrameTransform", "json"), b"{}"),
+        # Nobody has decided how a channel of that kind is read.
+        (2, Channel("/tf", TF, "cdr"), encode([moving("map", "odom", 1)])),
+    ],
+)
+def test_what_may_be_invalid_or_needs_a_judgement_is_left_to_the_slow_path(other: StoredMessage) -> None:
+    columns, _ = both([GOOD, (3, CDR, GOOD[2])])
+    assert columns is not None
+    decoders = {channel: ChannelDecoder(channel, static=False) for channel in (CDR, ROS1, OTHER)}
+    assert ColumnDecoder(decoders).decode(packed([GOOD, other])) is None
+
+
+@pytest.mark.parametrize("channel", [CDR, ROS1])
+def test_a_message_with_a_wrong_bit_is_left_to_the_slow_path_or_decoded_to_the_same(channel: Channel) -> None:
+    payload = payload_of(channel, [moving("map", "odom", 1), moving("odom", "base", 1)])
+    decoders = {channel: ChannelDecoder(channel, static=False)}
+    for place in range(len(payload)):
+        damaged = bytearray(payload)
+        damaged[place] ^= 1 << place % 8
+        columns = ColumnDecoder(decoders).decode(packed([(1, channel, payload), (2, channel, bytes(damaged))]))
+        if columns is None:
+            continue
+        found = decoders[channel].decode(bytes(damaged))
+        assert found.errors == []
+        whole = decoders[channel].decode(payload).samples + found.samples
+        assert sorted((s for each in columns for s in samples_in(each)), key=str) == sorted(whole, key=str)
+
+
+def test_leading_slashes_and_static_flags_are_those_of_the_channel() -> None:
+    payload = encode([moving("mmap", "bbase", 5)]).replace(b"mmap", b"/map").replace(b"bbase", b"/base")
+    decoder = ColumnDecoder({CDR: ChannelDecoder(CDR, static=True)})
+    columns = decoder.decode(packed([(1, CDR, payload)]))
+    assert columns is not None
+    (found,) = columns
+    assert found[:4] == ("map", "base", "", True)
+    assert samples_in(found) == [static("map", "base", stamp=5)]
+
+
+def test_samples_of_several_authorities_are_told_apart() -> None:
+    columns, _ = both([GOOD, (2, OTHER, encode([moving("map", "odom", 2)]))])
+    assert columns is not None
+    assert {(each.child, each.authority): each.stamps.tolist() for each in columns} == {
+        ("odom", "odometry"): [1],
+        ("base", "slam"): [1],
+        ("odom", "other"): [2],
+    }
+
+
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def stamped(
+    channel: Channel, seconds: int, nanoseconds: int, row: Sequence[float] = IDENTITY, child: bytes = b"odom"
+) -> bytes:
+    """A message of one transform, of which nothing is checked."""
+    write = write_ros1 if channel is ROS1 else write_cdr
+    return write([RawTransform(seconds, nanoseconds, b"map", child, struct.pack("<7d", *row))])
+
+
+@pytest.mark.parametrize(
+    ("channel", "seconds", "nanoseconds", "valid"),
+    [
+        (CDR, 2**31 - 1, 999_999_999, True),
+        (CDR, -(2**31), 0, True),
+        (CDR, 1, 1_000_000_000, False),
+        (ROS1, 2**31 - 1, 999_999_999, True),
+        (ROS1, 2**31, 0, False),
+        (ROS1, 2**32 - 1, 0, False),
+        (ROS1, 1, 1_000_000_000, False),
+    ],
+)
+def test_stamps_are_decoded_at_once_up_to_their_bounds(
+    channel: Channel, seconds: int, nanoseconds: int, valid: bool
+) -> None:
+    decoder = ColumnDecoder({channel: ChannelDecoder(channel, static=False)})
+    columns = decoder.decode(packed([(1, channel, stamped(channel, seconds, nanoseconds))]))
+    if valid:
+        assert columns is not None
+        assert columns[0].stamps.tolist() == [seconds * 10**9 + nanoseconds]
+    else:
+        assert columns is None
+
+
+@pytest.mark.parametrize(
+    ("norm", "valid"), [(0.99 - 1e-9, False), (0.99 + 1e-9, True), (1.01 - 1e-9, True), (1.01 + 1e-9, False)]
+)
+def test_a_quaternion_is_normalised_at_once_if_its_norm_is_off_by_no_more_than_a_hundredth(
+    norm: float, valid: bool
+) -> None:
+    columns, one_by_one = both([(1, CDR, stamped(CDR, 0, 5, (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, -norm)))])
+    assert (columns is not None) == valid == bool(one_by_one)
+    if columns is not None:
+        assert columns[0].rows.tolist() == [[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, -1.0]]
+
+
+@pytest.mark.parametrize("channel", [CDR, ROS1])
+def test_names_are_decoded_at_once_up_to_the_longest(channel: Channel) -> None:
+    for size, valid in ((MAX_NAME - 1, True), (MAX_NAME + 1, False)):
+        data = stamped(channel, 0, 1, child=b"n" * size)
+        decoders = {channel: ChannelDecoder(channel, static=False)}
+        assert (ColumnDecoder(decoders).decode(packed([(1, channel, data)])) is not None) == valid
+
+
+def test_messages_are_decoded_at_once_up_to_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tfbus.recording.formats.transforms.MAX_MESSAGE", len(GOOD[2]))
+    assert both([GOOD])[0] is not None
+    monkeypatch.setattr("tfbus.recording.formats.transforms.MAX_MESSAGE", len(GOOD[2]) - 1)
+    assert ColumnDecoder({CDR: ChannelDecoder(CDR, static=False)}).decode(packed([GOOD])) is None
+
+
+@pytest.mark.parametrize("names", [[f"f{k:03}" for k in range(200)], ["f" * k for k in range(1, 64)]])
+def test_many_frames_that_take_turns_are_decoded_at_once(names: list[str]) -> None:
+    stored: list[StoredMessage] = [(k, CDR, encode([moving("map", name, k)])) for k, name in enumerate(2 * names)]
+    columns, one_by_one = both(stored)
+    assert columns is not None
+    assert {each.child: samples_in(each) for each in columns} == one_by_one
+
+
+def test_a_channel_with_more_layouts_than_are_kept_is_left_to_the_slow_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    stored: list[StoredMessage] = [(k, CDR, encode([moving("map", f"f{k}", k)])) for k in range(4)]
+    monkeypatch.setattr("tfbus.recording.formats.transforms._MAX_LAYOUTS", 3)
+    assert both(stored[:3])[0] is not None
+    assert both(stored)[0] is None
+
+
+def test_messages_of_one_size_with_more_structures_than_are_kept_are_left_to_the_slow_path(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The longer one name is, the shorter is the other.
+    stored: list[StoredMessage] = [
+        (k, CDR, encode([moving("map", "a" * (8 * k + 3), k), moving("map", "b" * (8 * (4 - k) + 3), k)]))
+        for k in range(4)
+    ]
+    assert len({len(payload) for _, _, payload in stored}) == 1
+    monkeypatch.setattr("tfbus.recording.formats.transforms._MAX_STRUCTURES", 3)
+    assert both(stored[:3])[0] is not None
+    assert both(stored)[0] is None
