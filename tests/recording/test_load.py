@@ -1,6 +1,5 @@
 """A recording becomes a tree, with the answers of tf2."""
 
-import logging
 import math
 from collections import Counter
 from contextlib import closing
@@ -12,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin
-from support.recorded import SMALL, WRONG_IN_SMALL, answers, as_ros2, messages_in, real, write_mcap
+from support.recorded import SMALL, WRONG_IN_SMALL, Line, answers, as_ros2, messages_in, real, write_mcap
 from support.samples import any_samples, moving, over, static, x_of
 
 from tfbus import (
@@ -22,7 +21,6 @@ from tfbus import (
     Bus,
     DisconnectedError,
     ExtrapolationError,
-    RecordingError,
     Transform,
     TransformLookupError,
     TransformStamped,
@@ -31,9 +29,8 @@ from tfbus import (
 )
 from tfbus.recording import load, open_recording
 from tfbus.recording.formats.mcap_output import McapOutput
-from tfbus.recording.load import _MAX_CANDIDATES, MAX_DETAILS, Problems, SpeedLimit, fill
+from tfbus.recording.load import MAX_DETAILS, Problems, SpeedLimit, fill
 from tfbus.tf_message import MalformedMessageError
-from tfbus.tree.tree import forest_of
 
 TOLERANCE = 1e-9
 
@@ -190,14 +187,17 @@ def test_the_tree_has_the_samples_that_a_bus_would_accept(
     assert tree.to_yaml() == buffer.tree.to_yaml()
 
 
-def test_without_a_counter_the_problems_are_logged_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING, "tfbus"):
-        load(SMALL)
+def test_without_a_counter_the_problems_are_logged_in_one_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    load(SMALL)
     (record,) = caplog.records
     assert record.getMessage().startswith(f"left out of {SMALL}: 3 x not finite, 2 x frame name, ")
     caplog.clear()
-    load(SMALL, problems=Counter())
-    assert caplog.records == []
+    problems = Counter({"cycle": 10})
+    load(SMALL, problems=problems)
+    load(write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("a", "b", 1)])]))
+    assert (problems["cycle"], caplog.records) == (11, [])
 
 
 def test_what_is_not_read_although_it_may_hold_transforms_is_logged(
@@ -208,17 +208,6 @@ def test_what_is_not_read_although_it_may_hold_transforms_is_logged(
     assert [record.getMessage() for record in caplog.records] == [
         f"{path}: not read: 1 messages on topic /{name}/tf of type tf2_msgs/msg/TFMessage" for name in ("r1", "r2")
     ]
-
-
-def test_nothing_is_logged_for_a_good_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    load(write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("a", "b", 1)])]))
-    assert caplog.records == []
-
-
-def test_problems_are_added_to_a_given_counter() -> None:
-    problems = Counter({"cycle": 10})
-    load(SMALL, problems=problems)
-    assert problems["cycle"] == 11
 
 
 def test_the_progress_of_filling_a_tree_is_told_in_messages_read() -> None:
@@ -238,20 +227,11 @@ def test_the_details_of_damaged_messages_are_kept_up_to_a_number() -> None:
     assert problems.details == [f"number {number}" for number in range(MAX_DETAILS)]
 
 
-def test_a_missing_recording_raises(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError):
-        load(tmp_path / "run.mcap")
-
-
-def test_a_lookup_in_a_loaded_tree_is_not_stale_after_the_shape_has_changed(tmp_path: Path) -> None:
-    lines = [(time, "/tf", [moving("a" if time < 5 else "z", "b", time, float(time))]) for time in range(10)]
-    tree = load(
-        write_mcap(tmp_path / "run.mcap", [(0, "/tf_static", [static("root", "a"), static("root", "z")]), *lines])
-    )
-    assert tree.parent("b", 3) == "a"
-    assert tree.parent("b", 7) == "z"
-    forest = forest_of(tree)
-    assert (forest.changed, forest.new_parents) == (set(), set())
+def test_a_frame_has_the_parent_of_each_time(tmp_path: Path) -> None:
+    lines: list[Line] = [(time, "/tf", [moving("a" if time < 5 else "z", "b", time)]) for time in range(10)]
+    lines.insert(0, (0, "/tf_static", [static("root", "a"), static("root", "z")]))
+    tree = load(write_mcap(tmp_path / "run.mcap", lines))
+    assert (tree.parent("b", 3), tree.parent("b", 7)) == ("a", "z")
 
 
 def test_a_translation_that_is_not_physical_is_left_out_unless_the_bound_is_raised(tmp_path: Path) -> None:
@@ -285,45 +265,9 @@ def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(tmp_path: Pa
     asked = [0, 5, 9_990, 14_980, 14_990, 15_000, 17_995, 19_990]
     expected = [0.0, 0.5, 999.0, 1_498.0, -1.0, 1_500.0, 1_799.5, 1_999.0]
     assert [x_of(tree, "a", "b", stamp) for stamp in asked] == expected
-
-
-@pytest.mark.parametrize("axis", [None, 0, 1, 2])
-def test_samples_that_change_no_edge_are_stored_at_once_unless_one_is_beyond_the_bound(
-    tmp_path: Path, axis: int | None
-) -> None:
-    # The blocks of so many messages are several, and the first one names the frame.
-    lines = [(k, moving("a", "b", 10 * k, float(k), "slam")) for k in range(8_192 + 300)]
-    if axis is not None:
-        far = [0.0, 0.0, 0.0]
-        far[axis] = -1e5
-        lines.insert(8_400, (8_400, TransformStamped("a", "b", 83_995, Transform(far), "slam")))
-    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
-        output.write([(received, (sample,)) for received, sample in lines])
-        output.finish()
-    problems: Counter[str] = Counter()
-    tree = load(tmp_path / "run.mcap", problems=problems, max_translation=9e3)
-    assert problems == ({} if axis is None else {"not physical": 1})
-    (edge,) = tree.edges()
-    assert (edge.samples, edge.oldest, edge.newest, edge.authority) == (8_492, 0, 84_910, "slam")
-    assert [x_of(tree, "a", "b", stamp) for stamp in (81_915, 83_990, 84_000, 84_910)] == [
-        8_191.5,
-        8_399.0,
-        8_400.0,
-        8_491.0,
-    ]
-    tree.insert(moving("a", "b", 84_920, 8_492.0))
-    assert x_of(tree, "a", "b", 84_915) == 8_491.5
-
-
-def test_each_sample_of_a_block_is_inserted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Each message has a block of its own, and the first one names the frames.
-    monkeypatch.setattr("tfbus.recording.formats.mcap._FIRST_BLOCK", 1)
-    stamps = [1, 2, 3, 4, 4, 5]
-    lines = [(at, "/tf", [moving("a", "b", stamp), moving("b", "c", stamp)]) for at, stamp in enumerate(stamps)]
-    tree = load(write_mcap(tmp_path / "run.mcap", lines, chunk_size=1))
-    # One stamp comes twice.
-    assert (tree.inserted, tree.replaced, tree.expired) == (2 * 5, 2, 0)
-    assert [(edge.child, edge.samples) for edge in tree.edges()] == [("b", 5), ("c", 5)]
+    assert (tree.inserted, tree.replaced, tree.expired) == (2_000, 1, 0)
+    tree.insert(moving("a", "b", 20_000, 2_000.0))
+    assert x_of(tree, "a", "b", 19_995) == 1_999.5
 
 
 def kept(*places: float, speed: float = 2.0) -> tuple[list[float], Counter[str]]:
@@ -338,21 +282,27 @@ def kept(*places: float, speed: float = 2.0) -> tuple[list[float], Counter[str]]
     return [sample.transform.translation[0] for sample in found], limit.dropped
 
 
-def test_a_sample_that_is_too_far_from_the_last_one_kept_is_dropped() -> None:
-    assert kept(0, 1, 100, 3, 5) == ([0, 1, 3, 5], {"speed": 1})
-    assert kept(0, 2, 4) == ([0, 2, 4], {})
+@pytest.mark.parametrize(
+    ("places", "stay"),
+    [
+        ([0, 1, 100, 3, 5], [0, 1, 3, 5]),
+        ([0, 2, 4], [0, 2, 4]),
+        # The first sample goes if the next ones contradict it.
+        ([1e9, 0, 1, 2], [0, 1, 2]),
+        ([0, 1e9, 1, 2], [0, 1, 2]),
+        ([7], [7]),
+        ([0, 1e9], [0]),
+        ([0, 1e9, -1e9, 5e9], [0]),
+        # A frame that really is elsewhere is reached in time.
+        ([0, 0, 5, 5, 5], [0, 0, 5]),
+    ],
+)
+def test_a_sample_that_is_too_far_from_the_others_is_dropped(places: list[float], stay: list[float]) -> None:
+    gone = len(places) - len(stay)
+    assert kept(*places) == (stay, {"speed": gone} if gone else {})
 
 
-def test_the_first_sample_goes_if_the_next_ones_contradict_it() -> None:
-    assert kept(1e9, 0, 1, 2) == ([0, 1, 2], {"speed": 1})
-    assert kept(0, 1e9, 1, 2) == ([0, 1, 2], {"speed": 1})
-    assert kept(7) == ([7], {})
-    assert kept(0, 1e9) == ([0], {"speed": 1})
-    assert kept(0, 1e9, -1e9, 5e9) == ([0], {"speed": 3})
-
-
-def test_a_frame_that_really_is_elsewhere_is_reached_in_time() -> None:
-    assert kept(0, 0, 5, 5, 5) == ([0, 0, 5], {"speed": 2})
+MOST = 16
 
 
 def test_candidates_are_bounded() -> None:
@@ -363,10 +313,10 @@ def test_candidates_are_bounded() -> None:
     found, dropped = kept(*places, places[0])
     assert (len(found), dropped) == (1, {"speed": 40})
     # As long as it is remembered, it is confirmed, and the others go; of one more, two are forgotten in turn.
-    most = places[:_MAX_CANDIDATES]
-    assert kept(*most, places[0]) == ([places[0], places[0]], {"speed": _MAX_CANDIDATES - 1})
-    most = places[: _MAX_CANDIDATES + 1]
-    assert kept(*most, places[0]) == ([places[2]], {"speed": _MAX_CANDIDATES + 1})
+    most = places[:MOST]
+    assert kept(*most, places[0]) == ([places[0], places[0]], {"speed": MOST - 1})
+    most = places[: MOST + 1]
+    assert kept(*most, places[0]) == ([places[2]], {"speed": MOST + 1})
 
 
 def test_frames_parents_and_kinds_are_apart() -> None:
@@ -386,19 +336,12 @@ def test_a_speed_is_a_number_greater_than_zero(speed: Any, error: type[Exception
         SpeedLimit(speed)
 
 
-def test_a_speed_limit_holds_in_a_long_recording_that_would_be_stored_at_once(tmp_path: Path) -> None:
-    lines = [(k, "/tf", [moving("map", "base", k * SECOND, 1e6 if k == 1_900 else float(k))]) for k in range(2_000)]
-    problems: Counter[str] = Counter()
-    tree = load(write_mcap(tmp_path / "run.mcap", lines), max_speed=3.0, problems=problems)
-    assert [edge.samples for edge in tree.edges()] == [1_999]
-    assert problems == {"speed": 1}
-
-
 def test_load_leaves_out_what_nothing_can_have_reached(tmp_path: Path) -> None:
-    places = [5e9, 0, 1, 2, 77, 3]
-    lines = [(at, "/tf", [moving("map", "base", at * SECOND, x)]) for at, x in enumerate(places)]
-    path = write_mcap(tmp_path / "run.mcap", [*lines, (9, "/tf", [moving("map", "lone", 0, 5.0)])])
+    # So many would be stored at once.
+    places = [5e9, *range(1_000), 7e7, *range(1_000, 2_000)]
+    lines = [(at, "/tf", [moving("map", "base", at * SECOND, float(x))]) for at, x in enumerate(places)]
+    path = write_mcap(tmp_path / "run.mcap", [*lines, (9_000, "/tf", [moving("map", "lone", 0, 5.0)])])
     problems: Counter[str] = Counter()
     tree = load(path, max_speed=3.0, problems=problems)
-    assert {edge.child: edge.samples for edge in tree.edges()} == {"base": 4, "lone": 1}
+    assert {edge.child: edge.samples for edge in tree.edges()} == {"base": 2_000, "lone": 1}
     assert problems == {"speed": 2}

@@ -12,14 +12,13 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rosbags.rosbag2 import StoragePlugin
 from support.open_files import is_open
-from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in
+from support.recorded import batches_in, facts, messages_in
 from support.samples import moving, static
 
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import load, open_recording
-from tfbus.recording.formats.folder import _BLOCK, SqliteStorage
+from tfbus.recording.formats.folder import SqliteStorage
 from tfbus.recording.formats.storage import MAX_OTHER_MESSAGE
 from tfbus.recording.load import Problems
 from tfbus.tf_message import encode
@@ -81,11 +80,6 @@ def test_a_range_includes_both_ends_and_begins_with_what_was_static(tmp_path: Pa
     assert [message.received for message in messages_in(path, until=10)] == [10]
 
 
-def test_what_rosbags_writes_is_read(tmp_path: Path) -> None:
-    (path,) = as_ros2(SMALL, tmp_path / "bag", StoragePlugin.SQLITE3).glob("*.db3")
-    assert len(messages_in(path)) == len(messages_in(SMALL))
-
-
 def test_what_a_killed_writer_has_left_in_its_log_is_read(tmp_path: Path) -> None:
     running, killed = tmp_path / "running.db3", tmp_path / "killed.db3"
     with closing(sqlite3.connect(running)) as file:
@@ -99,15 +93,6 @@ def test_what_a_killed_writer_has_left_in_its_log_is_read(tmp_path: Path) -> Non
     assert batches_in(killed) == IN_ORDER
     with open_recording(killed) as recording:
         assert not recording.finished
-
-
-def test_an_empty_log_is_that_of_a_finished_file(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
-    write(path).close()
-    Path(f"{path}-wal").touch()
-    with open_recording(path) as recording:
-        assert recording.finished
-    assert batches_in(path) == IN_ORDER
 
 
 def test_all_topics_are_told_with_their_definitions_and_the_number_of_their_messages(tmp_path: Path) -> None:
@@ -154,14 +139,6 @@ def test_messages_on_topics_that_are_not_described_are_counted(tmp_path: Path) -
             file.commit()
         (lost,) = messages_in(path)
         assert (lost.received, len(lost.errors)) == (received, 1)
-
-
-def test_of_a_part_it_is_not_told_which_messages_are_on_topics_that_are_not_described(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
-    with write(path) as file:
-        add(file, 99, 60, b"")
-    file.close()
-    assert not any(message.errors for part in ((5, None), (None, 60)) for message in messages_in(path, *part))
 
 
 def test_reading_leaves_nothing_beside_the_file(tmp_path: Path) -> None:
@@ -228,18 +205,18 @@ def test_what_cannot_be_read_is_told_behind_the_last_message_that_was(tmp_path: 
     path = tmp_path / "run.db3"
     with write(path) as file:
         file.execute("ALTER TABLE messages RENAME TO stored")
-        size = f"CASE WHEN timestamp < {_BLOCK + 7} THEN 1 ELSE {MAX_OTHER_MESSAGE + 1} END"
+        size = f"CASE WHEN timestamp < {256 + 7} THEN 1 ELSE {MAX_OTHER_MESSAGE + 1} END"
         file.execute(f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data AS (zeroblob({size})))")
         # So that they need not be sorted, for which all would be read.
         file.execute("CREATE INDEX by_time ON messages(timestamp)")
-        for received in range(_BLOCK + 8):
+        for received in range(256 + 8):
             file.execute("INSERT INTO messages(topic_id, timestamp) VALUES (2, ?)", (received,))
     file.close()
     *read, lost, promised = messages_in(path)
     # SQLite's cursor is one row ahead.
-    assert [message.received for message in read] == list(range(_BLOCK + 6))
+    assert [message.received for message in read] == list(range(256 + 6))
     assert "nothing more can be read" in str(lost.errors[0])
-    assert (lost.received, promised.received) == (_BLOCK + 5, _BLOCK + 5)
+    assert (lost.received, promised.received) == (256 + 5, 256 + 5)
 
 
 def test_a_file_that_one_thread_has_opened_is_read_and_closed_by_another(tmp_path: Path) -> None:
