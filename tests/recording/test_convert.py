@@ -5,8 +5,6 @@ import sqlite3
 import struct
 import sys
 from contextlib import closing
-from dataclasses import FrozenInstanceError
-from hashlib import md5
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +20,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 from support.open_files import is_open
-from support.recorded import SMALL, Line, batches_in, messages_in, sender_of, write_mcap
+from support.recorded import SMALL, Line, batches_in, messages_in, write_mcap
 from support.samples import moving, static
-from support.strategies import CHARACTERS
 
 from tfbus import RecordingError
 from tfbus.recording import Conversion, Edits, convert, load, open_recording
@@ -37,14 +34,11 @@ from tfbus.recording.formats.copies import (
     MessageTypes,
     SqliteCopy,
     foxglove_channel,
-    transform_channel,
-    types_with_header,
     write_protobuf,
 )
 from tfbus.recording.formats.mcap_output import TYPE_HASH
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.formats.transforms import RawTransform, parser_of, write_cdr, write_ros1
-from tfbus.recording.load import MAX_DETAILS
 from tfbus.recording.recording import open_storage
 from tfbus.tf_message import MalformedMessageError, encode
 
@@ -184,15 +178,6 @@ def test_what_the_recorder_has_compressed_is_unfolded_and_what_only_looks_like_i
     assert [payload for _, _, payload in lines_of_others(path)] == [folded, torn, text]
 
 
-def test_details_are_kept_once_each_and_up_to_a_number() -> None:
-    done = Conversion()
-    for number in range(MAX_DETAILS + 1):
-        for _ in range(2):
-            done.note("type", f"number {number}")
-    assert done.problems == {"type": 2 * MAX_DETAILS + 2}
-    assert done.details == [f"number {number}" for number in range(MAX_DETAILS)]
-
-
 def test_runs_of_authorities_keep_their_lengths_and_a_single_one_stands_for_any_number(tmp_path: Path) -> None:
     frames = [moving("map", name, 1) for name in "abc"]
     metadata = {"tfbus.authorities": '[["x", 2], ["y", 1]]'}
@@ -240,27 +225,12 @@ def test_only_some_frames_stay_with_their_authorities_and_empty_messages_go(tmp_
     assert (done.messages, done.transforms) == (20, 20)
 
 
-def test_a_single_authority_is_the_node_that_a_bag_names(tmp_path: Path, source: Path) -> None:
-    convert([source], tmp_path / "run.bag", edits=Edits(frames=["wheel"]))
-    with rosbag1.Reader(tmp_path / "run.bag") as bag:
-        assert {sender_of(connection) for connection in bag.connections} == {"/b"}
-    assert {each.authority for _, batch in batches_in(tmp_path / "run.bag") for each in batch} == {"b"}
-
-
 def test_a_message_without_transforms_stays_and_one_that_loses_all_of_them_goes(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "run.mcap", [(1, "/tf", []), (2, "/tf", [moving("a", "b", 2)])])
     told: list[int] = []
     done = convert([source], tmp_path / "some.mcap", edits=Edits(frames=["c"]), progress=told.append)
     assert batches_in(tmp_path / "some.mcap") == [(1, ())]
     assert (done.messages, done.transforms, told) == (1, 0, [1, 1])
-
-
-def test_of_the_metadata_of_a_channel_the_quality_of_service_stays(tmp_path: Path) -> None:
-    profiles = {"offered_qos_profiles": "- history: 1"}
-    source = write_mcap(tmp_path / "run.mcap", LINES, metadata={**profiles, "other": "x"})
-    edited(tmp_path, source, prefix="r/")
-    with (tmp_path / "edited.mcap").open("rb") as file:
-        assert [channel.metadata for _, channel, _ in make_reader(file).iter_messages()] == [profiles] * len(LINES)
 
 
 def test_static_transforms_are_left_out_and_told(tmp_path: Path, source: Path) -> None:
@@ -376,19 +346,16 @@ def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: P
     assert raw(tmp_path / "back.bag") == raw(SMALL)
 
 
-def test_foxglove_s_schema_is_for_mcap_and_keeps_authorities(tmp_path: Path, source: Path) -> None:
+def test_wrong_edits_and_schemas_are_refused(tmp_path: Path, source: Path) -> None:
+    for arguments in ({"rename": {"a": "/b"}}, {"rename": {"a": ""}}, {"prefix": "/r"}):
+        with pytest.raises(ValueError, match="a frame name"):
+            Edits(**arguments)
     with pytest.raises(ValueError, match=r"must end in \.mcap"):
         convert([source], tmp_path / "run.bag", schema="foxglove")
     with pytest.raises(ValueError, match="'ros' or 'foxglove'"):
         convert([source], tmp_path / "run.mcap", schema="json")  # type: ignore[arg-type]
     convert([source], tmp_path / "run.mcap", schema="foxglove")
     assert batches_in(tmp_path / "run.mcap") == batches_in(source)
-
-
-def test_new_names_are_checked() -> None:
-    for arguments in ({"rename": {"a": "/b"}}, {"rename": {"a": ""}}, {"prefix": "/r"}):
-        with pytest.raises(ValueError, match="a frame name"):
-            Edits(**arguments)
 
 
 @pytest.mark.parametrize("ending", ["mcap", "bag", "db3"])
@@ -426,11 +393,6 @@ def test_a_link_that_somebody_has_made_beside_the_output_leads_nowhere(tmp_path:
 SLASHED = RawTransform(1, 2, b"/odom", b"/base", bytes(56))
 
 
-def test_edits_are_frozen() -> None:
-    with pytest.raises(FrozenInstanceError):
-        Edits().prefix = "r/"  # type: ignore[misc]
-
-
 def test_without_edits_nothing_changes_not_even_a_leading_slash() -> None:
     assert Edits() == Edits(frames=None, rename={}, prefix="", drop_static=False)
     assert Edits().apply(SLASHED) == SLASHED
@@ -453,22 +415,6 @@ def test_a_name_that_is_no_text_keeps_its_bytes() -> None:
 
 TF_CHANNEL = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr")
 PAYLOAD = encode([moving("a", "b", 5)])
-
-
-@pytest.mark.parametrize("kind", [McapCopy, BagCopy, SqliteCopy])
-def test_a_message_is_written_once_for_each_of_two_channels_of_one_topic(
-    tmp_path: Path, kind: type[McapCopy] | type[BagCopy] | type[SqliteCopy]
-) -> None:
-    path = tmp_path / "run"
-    copy = kind(path, "run")
-    same = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr")
-    for received, channel in ((1, TF_CHANNEL), (2, same), (3, TF_CHANNEL)):
-        copy.write(channel, received, PAYLOAD)
-    copy.finish()
-    assert not is_open(path)
-    assert [(message.received, message.batch) for message in messages_in(path)] == [
-        (received, (moving("a", "b", 5),)) for received in (1, 2, 3)
-    ]
 
 
 def test_a_copy_in_mcap_is_a_recording_of_ros_2(tmp_path: Path) -> None:
@@ -497,12 +443,6 @@ def test_times_before_1970_are_refused_where_a_format_has_none(tmp_path: Path) -
         # 1970 begins with 0.
         copy.write(TF_CHANNEL, 0, PAYLOAD)
         copy.close()
-
-
-def test_transforms_get_a_channel_in_the_encoding_of_the_copy() -> None:
-    assert transform_channel(TF_CHANNEL, "cdr", {"a": "b"}).type == "tf2_msgs/msg/TFMessage"
-    ros1 = transform_channel(TF_CHANNEL, "ros1", {})
-    assert (ros1.topic, ros1.type, ros1.encoding) == ("/tf", "tf2_msgs/TFMessage", "ros1")
 
 
 def test_a_copy_holds_transforms_in_its_own_encoding(tmp_path: Path) -> None:
@@ -572,30 +512,6 @@ def test_the_metadata_have_the_first_time_and_the_duration(
     assert [topic["message_count"] for topic in metadata["topics_with_message_count"]] == [len(times)] * bool(times)
 
 
-def test_the_metadata_have_the_hash_of_a_type_where_it_is_known(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
-    copy = SqliteCopy(path, "run.db3")
-    copy.write(TF_CHANNEL, 1, PAYLOAD)
-    copy.write(Channel("/talk", "std_msgs/msg/String", "cdr"), 2, b"")
-    copy.finish()
-    with closing(sqlite3.connect(path)) as file:
-        (metadata,) = file.execute("SELECT metadata FROM metadata").fetchone()
-        columns = dict(file.execute("SELECT name, type_description_hash FROM topics"))
-        assert [number for (number,) in file.execute("SELECT id FROM topics ORDER BY id")] == [1, 2]
-        ((version,),) = file.execute("SELECT metadata_version FROM metadata")
-    assert json.loads(metadata)["rosbag2_bagfile_information"]["version"] == version
-    topics = json.loads(metadata)["rosbag2_bagfile_information"]["topics_with_message_count"]
-    told = {topic["topic_metadata"]["name"]: topic["topic_metadata"]["type_description_hash"] for topic in topics}
-    assert told == columns == {"/tf": TYPE_HASH, "/talk": ""}
-
-
-@pytest.mark.parametrize(("kind", "name"), [("a/B", "a/msg/B"), ("a/msg/B", "a/msg/B")])
-def test_types_have_the_names_of_ros_2(kind: str, name: str) -> None:
-    assert MessageTypes.name(kind) == name
-    with pytest.raises(ValueError, match="no name of a type"):
-        MessageTypes.name("B")
-
-
 def test_a_type_that_the_file_defines_is_converted() -> None:
     cdr = Channel("/a", "my_msgs/msg/Pair", "cdr", "ros2msg", b"uint8 a\nuint32 b\n")
     ros1 = Channel("/a", "my_msgs/Pair", "ros1", "ros1msg", b"uint8 a\nuint32 b\n")
@@ -605,38 +521,6 @@ def test_a_type_that_the_file_defines_is_converted() -> None:
     definition, digest = MessageTypes().ros1_definition(cdr)
     assert "uint32 b" in definition
     assert len(digest) == 32
-
-
-def test_what_is_not_known_or_damaged_is_an_error() -> None:
-    unknown = Channel("/a", "my_msgs/msg/Pair", "cdr")
-    types = MessageTypes()
-    with pytest.raises(ValueError, match="cannot be converted"):
-        types.convert(unknown, b"\0\1\0\0")
-    with pytest.raises(ValueError, match="has no definition"):
-        types.ros1_definition(unknown)
-    damaged = Channel("/a", "my_msgs/msg/Pair", "cdr", "ros2msg", b"\xff{{")
-    with pytest.raises(ValueError, match="cannot be read"):
-        types.convert(damaged, b"")
-    # Told once, and then it is a type without a definition.
-    with pytest.raises(ValueError, match="cannot be converted"):
-        types.convert(damaged, b"")
-
-
-def test_the_errors_of_long_names_are_cut() -> None:
-    for schema in (b"", b"\xff{{"):
-        channel = Channel("/a", "my_msgs/msg/" + "x" * 300, "cdr", "ros2msg", schema)
-        for call in (lambda channel: MessageTypes().convert(channel, b""), MessageTypes().ros1_definition):
-            with pytest.raises(ValueError, match="x" * 99) as raised:
-                call(channel)
-            assert len(str(raised.value)) == 200
-
-
-def test_a_definition_of_ros_1_is_passed_on_with_its_digest() -> None:
-    own = Channel("/a", "my_msgs/Pair", "ros1", "ros1msg", b"uint8 a\n", {"md5sum": "1234"})
-    assert MessageTypes().ros1_definition(own) == ("uint8 a\n", "1234")
-    # Without one, it is that of the definition: the MD5 sum of its text, by ROS.
-    other = Channel("/a", "my_msgs/Pair", "ros1", "ros1msg", b"uint8 a\n")
-    assert MessageTypes().ros1_definition(other) == ("uint8 a\n", md5(b"uint8 a").hexdigest())
 
 
 @pytest.mark.parametrize(
@@ -656,23 +540,9 @@ def test_the_definition_of_a_type_of_ros_2_has_the_digest_of_ros_1(kind: str, di
     assert ("uint32 seq\ntime stamp\nstring frame_id\n" in definition) == (kind != "std_msgs/msg/String")
 
 
-def test_types_with_a_header_are_known() -> None:
-    assert "sensor_msgs/msg/LaserScan" in types_with_header()
-    assert "geometry_msgs/msg/Twist" not in types_with_header()
-
-
 CHANNEL = foxglove_channel(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"), {})
 
 numbers = st.lists(st.floats(), min_size=7, max_size=7).map(lambda values: struct.pack("<7d", *values))
-foxglove_names = st.text(CHARACTERS, max_size=200).filter(lambda text: text.isprintable()).map(str.encode)
-foxglove_transforms = st.builds(
-    RawTransform, st.integers(-(2**31), 2**40), st.integers(0, 2**31 - 1), foxglove_names, foxglove_names, numbers
-)
-
-
-@given(transforms=st.lists(foxglove_transforms, max_size=4))
-def test_what_foxglove_s_writer_writes_is_what_the_parser_reads(transforms: list[RawTransform]) -> None:
-    assert parser_of(CHANNEL)(write_protobuf(transforms)) == transforms
 
 
 def test_the_bytes_are_those_of_foxglove_s_own_encoder() -> None:
@@ -689,11 +559,6 @@ def test_the_bytes_are_those_of_foxglove_s_own_encoder() -> None:
     ).encode()
     ours = RawTransform(1_700_000_000, 300, b"map", b"base", struct.pack("<7d", 1.0, -2.0, 0.1, 0.1, 0.2, 0.3, 0.9))
     assert write_protobuf([ours]) == theirs
-
-
-def test_a_name_that_is_no_text_is_refused() -> None:
-    with pytest.raises(MalformedMessageError, match="UTF-8"):
-        write_protobuf([RawTransform(0, 0, b"map", b"\xff", bytes(56))])
 
 
 def test_the_seconds_that_a_stamp_of_foxglove_holds_are_written() -> None:

@@ -135,16 +135,6 @@ def test_the_shortest_finished_file_is_an_empty_recording_and_with_a_byte_less_i
         open_recording(path)
 
 
-def test_an_index_without_statistics_does_not_contradict_the_chunks(write: Write) -> None:
-    path = write(LINES, use_statistics=False, enable_crcs=False)
-    whole = path.read_bytes()
-    for part in (b"geometry_msgs/TransformStamped", b"/tf_static"):
-        data = bytearray(whole)
-        data[data.rindex(part)] ^= 1
-        path.write_bytes(data)
-        assert batches_in(path) == EXPECTED
-
-
 @pytest.mark.parametrize("finish", [True, False])
 def test_a_message_whose_log_time_is_no_stamp_is_reported_and_the_others_are_read(write: Write, finish: bool) -> None:
     late = [(2**63 + 5, "/tf", [moving("a", "b", 6)]), (2**64 - 1, "/tf", [moving("a", "b", 7)])]
@@ -256,13 +246,6 @@ def test_each_message_of_a_part_comes_once_in_blocks_of_any_size(
         assert len(list(recording.blocks())) == count
 
 
-def test_what_is_missing_is_told_behind_a_damaged_last_chunk(write: Write) -> None:
-    path = write([(time, "/tf", [moving("a", "b", time)]) for time in (5, 6, 7)], chunk_size=1)
-    damage(path, encode([moving("a", "b", 7)]))
-    for messages in (messages_in(path), in_blocks(path)):
-        assert [(message.received, len(message.errors)) for message in messages] == [(5, 0), (6, 0), (7, 1), (7, 1)]
-
-
 def test_a_chunk_without_transforms_is_not_read(write: Write) -> None:
     first, second = [moving("a", "b", 1)], [moving("a", "b", 3)]
     path = write([(1, "/tf", first), (2, "/camera", b"picture" * 1_000), (3, "/tf", second)], chunk_size=1)
@@ -328,24 +311,6 @@ def test_an_index_entry_that_leads_to_another_record_loses_only_its_chunk(write:
         assert read == EXPECTED[-len(read) :]
 
 
-def test_an_index_with_a_channel_that_has_no_schema_is_used(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as file:
-        writer: Any = Writer(file)
-        writer.start("ros2", "tests")
-        kind = writer.register_schema("tf2_msgs/msg/TFMessage", "ros2msg", b"")
-        for topic, schema in (("/tf", kind), ("/log", 0)):
-            writer.add_message(writer.register_channel(topic, "cdr", schema), 5, encode([moving("a", "b", 5)]), 5)
-        writer.finish()
-    with open_recording(path) as recording:
-        assert [(topic.name, topic.type, topic.count) for topic in recording.topics] == [
-            ("/log", "", 1),
-            ("/tf", "tf2_msgs/msg/TFMessage", 1),
-        ]
-        assert recording.count == 1
-    assert batches_in(path) == [(5, (moving("a", "b", 5),))]
-
-
 def test_an_unreadable_record_is_reported_and_the_next_ones_are_read(write: Write) -> None:
     path = write(LINES, finish=False)
     data = path.read_bytes()
@@ -366,30 +331,6 @@ def test_a_record_of_an_unknown_kind_is_told_with_its_place(write: Write) -> Non
     path.write_bytes(data + b"\x7f" + (3).to_bytes(8, "little") + b"abc" + data[8:])
     (lost,) = errors_in(messages_in(path))
     assert lost.endswith(f"the record at byte {len(data)}: its kind, 127, is unknown")
-
-
-@pytest.mark.parametrize(
-    "compression",
-    [
-        CompressionType.NONE,
-        *(pytest.param(kind, marks=pytest.mark.thorough) for kind in (CompressionType.LZ4, CompressionType.ZSTD)),
-    ],
-)
-def test_a_file_cut_at_any_byte_gives_the_messages_before_the_cut(write: Write, compression: CompressionType) -> None:
-    path = write(LINES[:10], compression=compression)
-    found, shortest = EXPECTED[:10], 10
-    for size in reversed(range(0, path.stat().st_size, 3)):
-        os.truncate(path, size)
-        try:
-            found = batches_in(path)
-        except RecordingError as error:
-            assert error.reason == ("truncated" if size else "empty")
-            found = []
-        assert found == EXPECTED[: len(found)]
-        # What can be read of a shorter file can be read of a longer one.
-        assert len(found) <= shortest
-        shortest = len(found)
-    assert found == []
 
 
 @given(data=st.data())
@@ -628,14 +569,6 @@ def test_the_messages_of_the_good_chunks_are_counted_beside_a_damaged_one(
     assert packed(damaged, low=6) == ([(6, lost.replace("1", "0", 1), b"")], {})
     # Where nothing is damaged, so many are packed.
     assert packed(good, good) == ([(7, "b", b"x")] * 2, {3: 2, 8: 2})
-
-
-def test_a_record_that_ends_where_another_chunk_has_begun_is_damage() -> None:
-    good = message(3, 7, b"x")
-    # Together, their bytes are records again.
-    found, counts = packed(good[:20], good[20:])
-    assert [text.partition(":")[0] for _, text, _ in found] == ["the chunk at byte 0", "the chunk at byte 1"]
-    assert counts == {}
 
 
 TF = Channel("/tf", "", "cdr")

@@ -43,48 +43,27 @@ from tfbus.tf_message import encode
 SECOND = 1_000_000_000
 
 
-def test_a_bag_tells_its_ends_and_how_many_messages_there_are() -> None:
+def test_a_bag_tells_its_ends_its_count_and_who_sent_what() -> None:
     with Reader(SMALL) as reader:
         count = reader.message_count
+        recorded = {sender_of(connection).removeprefix("/") for connection in reader.connections}
     # The first is a static transform a second before the start, the last the newest of the odometry, 2 ms late.
     with open_recording(SMALL) as recording:
         assert facts(recording) == (99 * SECOND, 109_982_000_000, count, True)
-        assert len(list(recording.messages())) == count
-
-
-def test_the_authority_is_the_node_that_sent_it() -> None:
-    senders = {sample.child: sample.authority for message in messages_in(SMALL) for sample in message.batch}
-    assert senders["odom"] == "slam"
-    assert senders["base_link"] == "odometry"
-    assert senders["laser"] == "calibration"
-    with Reader(SMALL) as reader:
-        recorded = {sender_of(connection) for connection in reader.connections}
-    assert set(senders.values()) == {name.removeprefix("/") for name in recorded}
-
-
-def test_leading_slashes_are_taken_off_the_names() -> None:
-    with Reader(SMALL) as reader:
-        assert any(b"\4\0\0\0/map" in raw for _, _, raw in reader.messages())
-    pairs = {(sample.parent, sample.child) for message in messages_in(SMALL) for sample in message.batch}
-    assert ("map", "odom") in pairs
-    assert ("base_link", "laser") in pairs
-    assert not any(name.startswith("/") for pair in pairs for name in pair)
-
-
-def test_a_good_transform_beside_a_bad_one_is_read() -> None:
-    beacons = [sample for message in messages_in(SMALL) for sample in message.batch if sample.child == "beacon"]
-    assert [sample.transform.translation[0] for sample in beacons] == [float(place) for place in range(10)]
+        messages = list(recording.messages())
+    assert len(messages) == count
+    senders = {sample.child: sample.authority for message in messages for sample in message.batch}
+    assert (senders["odom"], senders["base_link"], senders["laser"]) == ("slam", "odometry", "calibration")
+    assert set(senders.values()) == recorded
 
 
 def test_a_range_includes_both_ends() -> None:
     times = [message.received for message in messages_in(SMALL)]
     low, high = times[100], times[200]
-    within = [time for time in times if low <= time <= high]
-    statics = {
-        sample.child for message in messages_in(SMALL, until=low - 1) for sample in message.batch if sample.static
-    }
-    assert [message.received for message in messages_in(SMALL, low, high)] == [low] * len(statics) + within
-    assert statics == {"laser", "camera", "arm", "table"}
+    # Four static frames come from before.
+    assert [message.received for message in messages_in(SMALL, low, high)] == [low] * 4 + [
+        time for time in times if low <= time <= high
+    ]
 
 
 Line = tuple[int, str, list[TransformStamped]]
@@ -174,29 +153,6 @@ def test_a_finished_bag_without_messages_is_an_empty_recording(tmp_path: Path) -
         else:
             with pytest.raises(RecordingError, match="ends before its first message"):
                 open_recording(path)
-
-
-def test_a_damaged_description_in_an_index_that_is_cut_does_not_count(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
-    data = bytearray(write_bag(path))
-    place = data.rindex(b"type=tf2_msgs") + 5
-    data[place] ^= 1
-    path.write_bytes(data[:-1])
-    assert read(path) == (EXPECTED, [])
-
-
-def test_an_index_behind_the_end_that_counts_nothing_hides_no_message(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
-    data = bytearray(write_bag(path))
-    for name, value in (
-        (b"index_pos=", bytes([0, 0, 0, 1, 0, 0, 0, 0])),
-        (b"conn_count=", bytes(4)),
-        (b"chunk_count=", bytes(4)),
-    ):
-        place = data.index(name) + len(name)
-        data[place : place + len(value)] = value
-    path.write_bytes(data)
-    assert read(path) == (EXPECTED, [])
 
 
 @pytest.mark.parametrize(
@@ -436,38 +392,6 @@ def test_the_indexes_behind_the_chunks_tell_how_many_messages_there_are(tmp_path
             assert [(topic.name, topic.count) for topic in recording.topics] == [("/other", 1), ("/tf", count)]
 
 
-def test_a_chunk_of_which_its_index_has_an_unknown_connection_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
-    first = chunk(connection(0, b"/tf", **TF) + message(0, 1, write_ros1([])))
-    path.write_bytes(unfinished(first, index(0, 1), chunk(message(9, 2, b"y")), index(9, 2)))
-    whole, lost = messages_in(path)
-    assert (whole.received, whole.errors) == (SECOND + 5, ())
-    assert "1 messages are on connections that the file does not describe" in str(lost.errors[0])
-
-
-def test_a_topic_that_is_not_read_has_all_its_messages_counted(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
-    described = connection(0, b"/tf", **TF) + connection(1, b"/other", type=b"a/B")
-    # The second chunk is not read, as its index tells that nothing in it is wanted, so its damage is not met.
-    first, second = described + message(1, 1, b"x"), message(1, 2, b"y") + message(1, 3, b"z") + b"\xff" * 9
-    path.write_bytes(unfinished(chunk(first), chunk(second), index(1, 2, 3), chunk(message(0, 4, b"x"))))
-    with open_recording(path) as recording:
-        assert [message.received for message in without_unfinished(recording.messages())] == [4 * SECOND + 5]
-        assert [(topic.name, topic.count) for topic in recording.topics] == [("/other", 3), ("/tf", 1)]
-
-
-def test_a_type_that_one_flipped_bit_has_made_unknown_is_mentioned(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
-    data = bytearray(write_bag(path))
-    index = int.from_bytes(data[data.index(b"index_pos=") + 10 :][:8], "little")
-    place = data.index(b"type=tf2_msgs", index) + 5
-    data[place] ^= 1
-    path.write_bytes(data)
-    with open_recording(path) as recording:
-        remarks = recording.remarks
-    assert any("uf2_msgs/TFMessage" in remark for remark in remarks)
-
-
 @given(data=st.data())
 def test_one_flipped_bit_never_loses_a_message_in_silence(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
@@ -530,14 +454,6 @@ def test_a_chunk_holds_messages_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -
         assert split_chunk(data + message(1, 4, b"z", order)).damage == damage
 
 
-def test_what_comes_before_damage_is_kept() -> None:
-    data = message(1, 2, b"x") + message(1, 3, b"yy")
-    assert split_chunk(data[:-1])[2] == "it ends inside of a record"
-    assert len(split_chunk(data[:-1]).messages) == 1
-    unknown = message(1, 2, b"x") + record(field(b"op", b"\x63"))
-    assert split_chunk(unknown).damage == "a record of kind 99 is unknown"
-
-
 def test_a_chunk_is_found_by_its_bytes() -> None:
     noise = b"\x04\0\0\0op=\x05" + bytes(range(256)) * 10
     file = io.BytesIO(noise + CHUNK_RECORD + b"more")
@@ -570,29 +486,6 @@ def test_a_record_of_another_kind_with_the_mark_of_a_chunk_in_a_field_is_no_chun
     assert find_chunk(io.BytesIO(real), 1) is None
     # It is at the very begin of the data of one that has none itself.
     assert find_chunk(io.BytesIO(record(field(b"size", bytes(4)) + field(b"op", b"\5\0"), mark)), 0) is None
-
-
-def test_a_record_that_claims_more_than_its_bound_is_not_read() -> None:
-    file = io.BytesIO(CHUNK_RECORD)
-    found = read_record(file, 0)
-    assert found.read(file, 3) == b"abc"
-    with pytest.raises(ValueError, match="claims 3 bytes, and 2 is the bound"):
-        found.read(file, 2)
-    file = io.BytesIO(CHUNK_RECORD + bytes(4))
-    # Where the file stands does not matter.
-    file.seek(5)
-    assert found.read(file) == b"abc"
-
-
-@pytest.mark.parametrize(("bound", "fits"), [(0, True), (-1, False)])
-def test_a_header_is_read_up_to_its_bound(monkeypatch: pytest.MonkeyPatch, bound: int, fits: bool) -> None:
-    (length,) = struct.unpack_from("<I", CHUNK_RECORD)
-    monkeypatch.setattr(ros1, "_MAX_HEADER", length + bound)
-    if fits:
-        assert read_record(io.BytesIO(CHUNK_RECORD), 0).kind == CHUNK
-    else:
-        with pytest.raises(ValueError, match=f"a header claims {length} bytes"):
-            read_record(io.BytesIO(CHUNK_RECORD), 0)
 
 
 def test_a_chunk_is_unfolded_up_to_its_bound_and_has_the_size_that_it_claims(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,14 +15,12 @@ import pytest
 import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
-from support.recorded import SMALL, write_mcap
+from support.recorded import write_mcap
 from support.samples import moving
 
 from tfbus.recording import open_recording
-from tfbus.recording.formats import mcap, storage
-from tfbus.recording.formats.mcap import McapStorage
+from tfbus.recording.formats import storage
 from tfbus.recording.formats.storage import (
-    _BLOCK,
     MIB,
     Channel,
     ChunkPlace,
@@ -30,9 +28,7 @@ from tfbus.recording.formats.storage import (
     StoredMessage,
     UnfoldError,
     batches,
-    blocks_of,
     in_order,
-    lost_message,
     max_unpacked,
     merge_chunks,
     pack,
@@ -42,7 +38,6 @@ from tfbus.recording.formats.storage import (
     unfold,
     unfold_file,
 )
-from tfbus.recording.recording import open_storage
 from tfbus.stamps import STAMP_MAX
 
 TF, OTHER, STATIC = Channel("/tf", "", "cdr"), Channel("/tf", "", "cdr"), Channel("/tf_static", "", "cdr")
@@ -56,16 +51,6 @@ def test_a_range_includes_both_ends_and_what_is_in_it_is_counted() -> None:
     assert [stored[0] for stored in select(BLOCKS, None, None, Counter())] == [1, 2, 3, 4]
 
 
-def test_a_log_time_that_is_no_stamp_is_lost_at_the_time_before() -> None:
-    blocks: list[list[StoredMessage]] = [[(7, TF, b"")], [(2**63, TF, b""), (9, TF, b"")]]
-    _, (received, error, _), (last, _, _) = select(blocks, None, None, Counter())
-    assert (received, last) == (7, 9)
-    assert "has the log time 9223372036854775808 ns" in str(error)
-    # The last stamp is one, also beside a log time that is none.
-    first, second = select([[(STAMP_MAX, TF, b""), (STAMP_MAX + 1, TF, b"")]], None, None, Counter())
-    assert (first, isinstance(second[1], Channel)) == ((STAMP_MAX, TF, b""), False)
-
-
 def test_a_log_time_that_is_no_stamp_is_lost_at_the_start_of_the_range_or_behind_the_messages_of_its_block() -> None:
     wrong: StoredMessage = (STAMP_MAX + 1, TF, b"")
     cases: list[tuple[int | None, list[list[StoredMessage]], list[int]]] = [
@@ -76,12 +61,6 @@ def test_a_log_time_that_is_no_stamp_is_lost_at_the_start_of_the_range_or_behind
     ]
     for since, blocks, times in cases:
         assert [received for received, _, _ in select(blocks, since, None, Counter())] == times
-
-
-def test_lost_messages_are_counted_by_none_of_the_channels() -> None:
-    read: Counter[Channel] = Counter()
-    assert len(list(select([[(1, TF, b""), lost_message(2, "gone")]], None, None, read))) == 2
-    assert (read[TF], read[OTHER]) == (1, 0)
 
 
 def test_what_is_promised_is_compared_by_topic() -> None:
@@ -113,10 +92,6 @@ def test_packed_messages_are_those_that_were_packed_in_the_order_of_their_log_ti
     assert unpacked(in_order(packed, low, high)) == expected
 
 
-def test_lost_messages_are_not_packed() -> None:
-    assert pack([(1, A, b""), lost_message(2, "gone")]) is None
-
-
 def test_a_log_time_that_is_no_stamp_comes_last_and_one_by_one() -> None:
     packed = pack([(5, A, b"x"), (3, B, b"y")])
     assert packed is not None
@@ -139,37 +114,22 @@ def test_batches_are_bounded_by_number_and_by_bytes(monkeypatch: pytest.MonkeyPa
     assert [len(block) for block in batches(iter(stored))] == [2, 1]
 
 
-@pytest.mark.parametrize("together", [1, 2**16])
 @pytest.mark.parametrize("span", [(None, None), (40, 90)])
+@pytest.mark.parametrize("overlap", [15, 100])
 def test_a_file_whose_chunks_overlap_is_packed_in_the_order_of_log_times(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, together: int, span: tuple[int | None, int | None]
+    tmp_path: Path, span: tuple[int | None, int | None], overlap: int
 ) -> None:
-    monkeypatch.setattr(mcap, "_FIRST_BLOCK", together)
-    monkeypatch.setattr(mcap, "_BLOCK", together)
-    # Each chunk ends behind the beginning of the next one.
-    times = [k + (15 if k % 10 == 9 else 0) for k in range(120)]
+    # Each chunk ends behind the beginning of the next one, or of very many.
+    times = [k + (overlap if k % 10 == 9 else 0) for k in range(400)]
     path = write_mcap(
-        tmp_path / "run.mcap", [(time, "/tf", [moving("map", "base", time)]) for time in times], chunk_size=1_000
+        tmp_path / "run.mcap", [(time, "/tf", [moving("map", "base", time)]) for time in times], chunk_size=500
     )
-    storage = McapStorage(path)
-    try:
-        assert len(storage.index) > 3
-        expected = list(storage.messages(lambda _: True, *span))
-        assert [received for received, _, _ in expected] == sorted(received for received, _, _ in expected)
-        assert unpacked(storage.packed(lambda _: True, *span)) == expected
-        assert unpacked(storage.packed(lambda _: False, *span)) == list(storage.messages(lambda _: False, *span))
-        monkeypatch.setattr(mcap, "_MOST_OVERLAPPING", 1)
-        assert unpacked(storage.packed(lambda _: True, *span)) == expected
-    finally:
-        storage.close()
-
-
-def test_storages_that_do_not_pack_give_the_same_messages() -> None:
-    storage = open_storage(SMALL)
-    try:
-        assert unpacked(blocks_of(storage, lambda _: True)) == list(storage.messages(lambda _: True))
-    finally:
-        storage.close()
+    with open_recording(path) as recording:
+        expected = list(recording.messages(*span))
+        assert [message.received for message in expected] == sorted(
+            time for time in times if (span[0] or 0) <= time <= (span[1] or 500)
+        )
+        assert [message for block in recording.blocks(*span) for message in block.messages()] == expected
 
 
 CHANNEL = Channel("/tf", "", "cdr")
@@ -227,12 +187,6 @@ def test_chunks_that_do_not_overlap_are_parts_of_an_index(spans: list[tuple[int,
     assert [place for part in found for place in places[part]] == places
 
 
-def test_chunks_that_touch_are_one_part_where_the_file_has_them_in_another_order() -> None:
-    last = ChunkPlace(20, 21, 0)
-    assert separate([ChunkPlace(0, 5, 1), ChunkPlace(5, 9, 2), last]) == [slice(0, 2), slice(2, 3)]
-    assert separate([ChunkPlace(0, 4, 1), ChunkPlace(5, 9, 2), last]) == [slice(0, 1), slice(1, 2), slice(2, 3)]
-
-
 DATA = bytes(range(256)) * 256
 FOLD: dict[str, Callable[[bytes], bytes]] = {
     "zstd": zstandard.compress,
@@ -250,14 +204,6 @@ def test_what_was_folded_unfolds_to_the_same_up_to_the_bound(kind: str) -> None:
     assert unfold(folded, kind, len(DATA)) == DATA
     with pytest.raises(UnfoldError, match=f"more than {len(DATA) - 1:,} bytes"):
         unfold(folded, kind, len(DATA) - 1)
-
-
-@pytest.mark.parametrize("kind", FOLD)
-def test_a_bound_of_whole_blocks_is_a_bound_too(kind: str) -> None:
-    data = bytes(2 * _BLOCK)
-    assert unfold(FOLD[kind](data), kind, len(data)) == data
-    with pytest.raises(UnfoldError, match=f"more than {len(data):,} bytes"):
-        unfold(FOLD[kind](data + b"x"), kind, len(data))
 
 
 @pytest.mark.parametrize("kind", COMPRESSED)

@@ -21,12 +21,11 @@ from tfbus.recording.formats.transforms import (
     Columns,
     RawTransform,
     bounded,
-    holds_transforms,
     parser_of,
     write_cdr,
     write_ros1,
 )
-from tfbus.tf_message import MAX_NAME, MalformedMessageError, encode
+from tfbus.tf_message import MalformedMessageError, encode
 
 NUMBERS = struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1)
 ONE = RawTransform(5, 6, b"map", b"base", NUMBERS)
@@ -128,11 +127,6 @@ def test_a_message_that_is_cut_anywhere_is_malformed(channel: Channel, payload: 
     assert reasons == ({"truncated"} if channel is ROS1 else {"truncated", "encoding", "text"})
 
 
-def test_what_is_behind_a_message_of_ros_1_is_told() -> None:
-    with pytest.raises(MalformedMessageError, match=r"\(oversized\): 1 bytes behind the last transform"):
-        parser_of(ROS1)(write_ros1([ONE]) + bytes(1))
-
-
 @pytest.mark.parametrize(
     ("write", "channel", "low", "high"), [(write_cdr, CDR, -(2**31), 2**31), (write_ros1, ROS1, 0, 2**32)]
 )
@@ -195,21 +189,6 @@ def test_protobuf_is_read_by_the_schema_in_the_file() -> None:
         parser_of(foxglove("protobuf", schema=schema))(b"\xff" * 20)
 
 
-@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
-@given(payload=st.binary(max_size=200))
-def test_any_bytes_are_transforms_or_malformed(encoding: str, payload: bytes) -> None:
-    try:
-        parser_of(Channel("/tf", "tf2_msgs/msg/TFMessage", encoding))(payload)
-    except MalformedMessageError as error:
-        assert error.reason
-
-
-def test_a_message_in_another_encoding_is_told_by_its_header() -> None:
-    parse = parser_of(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"))
-    with pytest.raises(MalformedMessageError, match=r"its header is 00 07 00 00$"):
-        parse(b"\0\7\0\0\1\2\3\4")
-
-
 def test_of_a_long_text_the_error_shows_the_beginning() -> None:
     body = struct.pack("<I", 1) + bytes(8) + struct.pack("<I", 50) + b"x" * 50 + bytes(80)
     with pytest.raises(MalformedMessageError, match=f"the string b'{'x' * 40}' does not end with NUL"):
@@ -233,28 +212,10 @@ def test_a_message_is_bounded_compressed_or_not(monkeypatch: pytest.MonkeyPatch)
         assert raised.value.reason == reason
 
 
-def test_only_known_types_in_known_encodings_hold_transforms() -> None:
-    assert holds_transforms(Channel("/x", "tf2_msgs/msg/TFMessage", "cdr"))
-    assert not holds_transforms(Channel("/x", "tf2_msgs/msg/TFMessage", "json"))
-    assert holds_transforms(foxglove("json"))
-    assert not holds_transforms(foxglove("cbor"))
-    assert not holds_transforms(Channel("/tf", "std_msgs/msg/String", "cdr"))
-
-
 BY_ODOMETRY = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr", metadata={"tfbus.authorities": '[["odometry", 1]]'})
 SAMPLES = [moving("odom", "base", 3, 1.5, "odometry"), moving("base", "wheel", 4, 2.5, "odometry")]
 PAYLOAD = encode(SAMPLES)
 BY_ROS_1 = bytes(get_typestore(Stores.ROS2_HUMBLE).cdr_to_ros1(PAYLOAD, "tf2_msgs/msg/TFMessage"))
-
-
-@pytest.mark.parametrize(
-    ("channel", "payload"),
-    [(BY_ODOMETRY, PAYLOAD), (BY_ODOMETRY, zstandard.compress(PAYLOAD)), (ROS1, BY_ROS_1)],
-    ids=str,
-)
-def test_the_samples_are_those_that_were_sent_in_whatever_they_are_wrapped(channel: Channel, payload: bytes) -> None:
-    found = ChannelDecoder(channel, static=False).decode(payload)
-    assert (found.samples, found.errors) == (SAMPLES, [])
 
 
 @pytest.mark.parametrize(
@@ -305,24 +266,6 @@ def test_any_bytes_are_samples_or_malformed(channel: Channel, payload: bytes) ->
         ChannelDecoder(channel, static=False).decode(payload)
     except MalformedMessageError as error:
         assert error.reason
-
-
-@pytest.mark.parametrize("channel", [BY_ODOMETRY, ROS1])
-@given(data=st.data())
-def test_a_message_that_is_cut_or_turned_over_is_samples_or_malformed(channel: Channel, data: st.DataObject) -> None:
-    payload = bytearray(PAYLOAD if channel is BY_ODOMETRY else BY_ROS_1)
-    payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
-    end = data.draw(st.integers(0, len(payload)))
-    try:
-        ChannelDecoder(channel, static=False).decode(bytes(payload[:end]))
-    except MalformedMessageError as error:
-        assert error.reason
-
-
-def test_what_only_looks_compressed_is_malformed() -> None:
-    with pytest.raises(MalformedMessageError) as raised:
-        ChannelDecoder(BY_ODOMETRY, static=False).decode(b"\x28\xb5\x2f\xfd" + b"\xff" * 30)
-    assert raised.value.reason == "encoding"
 
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
@@ -483,16 +426,6 @@ def test_leading_slashes_and_static_flags_are_those_of_the_channel() -> None:
     assert samples_in(found) == [static("map", "base", stamp=5)]
 
 
-def test_samples_of_several_authorities_are_told_apart() -> None:
-    columns, _ = both([GOOD, (2, OTHER, encode([moving("map", "odom", 2)]))])
-    assert columns is not None
-    assert {(each.child, each.authority): each.stamps.tolist() for each in columns} == {
-        ("odom", "odometry"): [1],
-        ("base", "slam"): [1],
-        ("odom", "other"): [2],
-    }
-
-
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -540,45 +473,9 @@ def test_a_quaternion_is_normalised_at_once_if_its_norm_is_off_by_no_more_than_a
         assert columns[0].rows.tolist() == [[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, -1.0]]
 
 
-@pytest.mark.parametrize("channel", [CDR, ROS1])
-def test_names_are_decoded_at_once_up_to_the_longest(channel: Channel) -> None:
-    for size, valid in ((MAX_NAME - 1, True), (MAX_NAME + 1, False)):
-        data = stamped(channel, 0, 1, child=b"n" * size)
-        decoders = {channel: ChannelDecoder(channel, static=False)}
-        assert (ColumnDecoder(decoders).decode(packed([(1, channel, data)])) is not None) == valid
-
-
-def test_messages_are_decoded_at_once_up_to_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tfbus.recording.formats.transforms.MAX_MESSAGE", len(GOOD[2]))
-    assert both([GOOD])[0] is not None
-    monkeypatch.setattr("tfbus.recording.formats.transforms.MAX_MESSAGE", len(GOOD[2]) - 1)
-    assert ColumnDecoder({CDR: ChannelDecoder(CDR, static=False)}).decode(packed([GOOD])) is None
-
-
 @pytest.mark.parametrize("names", [[f"f{k:03}" for k in range(200)], ["f" * k for k in range(1, 64)]])
 def test_many_frames_that_take_turns_are_decoded_at_once(names: list[str]) -> None:
     stored: list[StoredMessage] = [(k, CDR, encode([moving("map", name, k)])) for k, name in enumerate(2 * names)]
     columns, one_by_one = both(stored)
     assert columns is not None
     assert {each.child: samples_in(each) for each in columns} == one_by_one
-
-
-def test_a_channel_with_more_layouts_than_are_kept_is_left_to_the_slow_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    stored: list[StoredMessage] = [(k, CDR, encode([moving("map", f"f{k}", k)])) for k in range(4)]
-    monkeypatch.setattr("tfbus.recording.formats.transforms._MAX_LAYOUTS", 3)
-    assert both(stored[:3])[0] is not None
-    assert both(stored)[0] is None
-
-
-def test_messages_of_one_size_with_more_structures_than_are_kept_are_left_to_the_slow_path(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # The longer one name is, the shorter is the other.
-    stored: list[StoredMessage] = [
-        (k, CDR, encode([moving("map", "a" * (8 * k + 3), k), moving("map", "b" * (8 * (4 - k) + 3), k)]))
-        for k in range(4)
-    ]
-    assert len({len(payload) for _, _, payload in stored}) == 1
-    monkeypatch.setattr("tfbus.recording.formats.transforms._MAX_STRUCTURES", 3)
-    assert both(stored[:3])[0] is not None
-    assert both(stored)[0] is None
