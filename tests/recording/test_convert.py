@@ -54,6 +54,11 @@ LINES: list[Line] = [
 EXPECTED = [(received, tuple(samples)) for received, _, samples in LINES]
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
 def raw(path: Path) -> list[tuple[int, str, list[RawTransform]]]:
     """Log time, topic and the transforms of all messages, bit by bit."""
     storage = open_storage(path)
@@ -137,9 +142,11 @@ def test_a_bag_made_of_cdr_describes_its_types_as_ros_1_does(tmp_path: Path) -> 
     ]
 
 
-def test_other_topics_pass_through_untouched_or_are_converted_where_the_format_needs_it(tmp_path: Path) -> None:
+def test_other_topics_pass_through_untouched_or_are_converted_where_the_format_needs_it(
+    tmp_path: Path, path: Path
+) -> None:
     text = bytes(TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String"))
-    source = write_mcap(tmp_path / "run.mcap", [(5, "/said", text)], schema="std_msgs/msg/String")
+    source = write_mcap(path, [(5, "/said", text)], schema="std_msgs/msg/String")
     bag, back = tmp_path / "run.bag", tmp_path / "back.db3"
     convert([source], tmp_path / "same.mcap")
     assert lines_of_others(tmp_path / "same.mcap") == [("/said", 5, text)]
@@ -149,9 +156,9 @@ def test_other_topics_pass_through_untouched_or_are_converted_where_the_format_n
     assert lines_of_others(back) == [("/said", 5, text)]
 
 
-def test_what_a_format_cannot_hold_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_what_a_format_cannot_hold_is_left_out_and_counted(tmp_path: Path, path: Path) -> None:
     lines: list[Line] = [(1, "/a", b"{}"), (2, "/a", b"{}")]
-    source = write_mcap(tmp_path / "run.mcap", lines, schema="my.Thing", encoding="json")
+    source = write_mcap(path, lines, schema="my.Thing", encoding="json")
     for ending in (".bag", ".db3"):
         done = convert([source], tmp_path / f"run{ending}")
         assert (done.messages, done.problems) == (0, {"format": 2})
@@ -225,8 +232,8 @@ def test_only_some_frames_stay_with_their_authorities_and_empty_messages_go(tmp_
     assert (done.messages, done.transforms) == (20, 20)
 
 
-def test_a_message_without_transforms_stays_and_one_that_loses_all_of_them_goes(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "run.mcap", [(1, "/tf", []), (2, "/tf", [moving("a", "b", 2)])])
+def test_a_message_without_transforms_stays_and_one_that_loses_all_of_them_goes(tmp_path: Path, path: Path) -> None:
+    source = write_mcap(path, [(1, "/tf", []), (2, "/tf", [moving("a", "b", 2)])])
     told: list[int] = []
     done = convert([source], tmp_path / "some.mcap", edits=Edits(frames=["c"]), progress=told.append)
     assert batches_in(tmp_path / "some.mcap") == [(1, ())]
@@ -251,10 +258,10 @@ def test_a_part_begins_with_the_static_transforms_from_before(tmp_path: Path, so
 
 
 def test_static_transforms_from_before_a_part_come_once_each_in_the_order_in_which_they_came_last(
-    tmp_path: Path,
+    tmp_path: Path, path: Path
 ) -> None:
     sent = [(k, static("base", name, x)) for k, name, x in ((1, "a", 1.0), (2, "b", 1.0), (3, "a", 1.0), (4, "b", 2.0))]
-    source = write_mcap(tmp_path / "run.mcap", [(k, "/tf_static", [sample]) for k, sample in sent])
+    source = write_mcap(path, [(k, "/tf_static", [sample]) for k, sample in sent])
     b, a, other = sent[1][1], sent[2][1], sent[3][1]
     for since, expected in (
         (1, [(k, (sample,)) for k, sample in sent]),
@@ -301,12 +308,12 @@ def test_a_wrong_output_is_refused_and_nothing_is_left_behind(tmp_path: Path, so
     assert len(load(there).frames()) == 5
 
 
-def test_foxglove_transforms_become_those_of_ros(tmp_path: Path) -> None:
+def test_foxglove_transforms_become_those_of_ros(tmp_path: Path, path: Path) -> None:
     text = (
         b'{"transforms": [{"timestamp": {"sec": 1, "nsec": 2}, "parent_frame_id": "a", "child_frame_id": "b", '
         b'"translation": {"x": 1, "y": 2, "z": 0.1}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}]}'
     )
-    source = write_mcap(tmp_path / "run.mcap", [(5, "/tf", text)], schema="foxglove.FrameTransforms", encoding="json")
+    source = write_mcap(path, [(5, "/tf", text)], schema="foxglove.FrameTransforms", encoding="json")
     convert([source], tmp_path / "run.bag")
     ((received, topic, (found,)),) = raw(tmp_path / "run.bag")
     assert (received, topic, found[:4]) == (5, "/tf", (1, 2, b"a", b"b"))
@@ -316,8 +323,7 @@ def test_foxglove_transforms_become_those_of_ros(tmp_path: Path) -> None:
         assert [topic.type for topic in recording.topics] == ["foxglove.FrameTransforms"]
 
 
-def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: Path, path: Path) -> None:
     done = convert([SMALL], path, schema="foxglove")
     assert done.problems == {}
     assert raw(path) == raw(SMALL)
@@ -346,16 +352,16 @@ def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: P
     assert raw(tmp_path / "back.bag") == raw(SMALL)
 
 
-def test_wrong_edits_and_schemas_are_refused(tmp_path: Path, source: Path) -> None:
+def test_wrong_edits_and_schemas_are_refused(tmp_path: Path, path: Path, source: Path) -> None:
     for arguments in ({"rename": {"a": "/b"}}, {"rename": {"a": ""}}, {"prefix": "/r"}):
         with pytest.raises(ValueError, match="a frame name"):
             Edits(**arguments)
     with pytest.raises(ValueError, match=r"must end in \.mcap"):
         convert([source], tmp_path / "run.bag", schema="foxglove")
     with pytest.raises(ValueError, match="'ros' or 'foxglove'"):
-        convert([source], tmp_path / "run.mcap", schema="json")  # type: ignore[arg-type]
-    convert([source], tmp_path / "run.mcap", schema="foxglove")
-    assert batches_in(tmp_path / "run.mcap") == batches_in(source)
+        convert([source], path, schema="json")  # type: ignore[arg-type]
+    convert([source], path, schema="foxglove")
+    assert batches_in(path) == batches_in(source)
 
 
 @pytest.mark.parametrize("ending", ["mcap", "bag", "db3"])
@@ -490,8 +496,7 @@ def test_a_bag_is_latching_where_transforms_are_static(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("times", "start", "duration"),
-    [([], 0, 0), ([0], 0, 0), ([7, 5, 9], 5, 4), ([-9, -5, -7], -9, 4)],
+    ("times", "start", "duration"), [([], 0, 0), ([0], 0, 0), ([7, 5, 9], 5, 4), ([-9, -5, -7], -9, 4)]
 )
 def test_the_metadata_have_the_first_time_and_the_duration(
     tmp_path: Path, times: list[int], start: int, duration: int

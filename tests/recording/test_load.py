@@ -41,6 +41,11 @@ ERRORS: dict[str, type[TransformLookupError]] = {
 }
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
 def disagreement(tree: TransformTree, answer: dict[str, Any]) -> str:
     """The answers of the tree that differ from those of tf2."""
     at = LATEST if answer["at"] is None else answer["at"]
@@ -125,46 +130,46 @@ def test_samples_are_kept_however_old_they_are(tmp_path: Path) -> None:
     assert x_of(tree, "a", "b", 250_000 * SECOND) == pytest.approx(250_000.0)
 
 
-def test_an_authority_that_joins_another_in_a_long_recording_is_loaded_too(tmp_path: Path) -> None:
-    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
+def test_an_authority_that_joins_another_in_a_long_recording_is_loaded_too(path: Path) -> None:
+    with closing(McapOutput(str(path), overwrite=True)) as output:
         senders = [1 if k > 1_000 and k % 2 else 0 for k in range(1_200)]
         output.write([(k, (moving("a", "b", k, float(k), f"sender {one}"),)) for k, one in enumerate(senders)])
         output.finish()
-    tree = load(tmp_path / "run.mcap")
+    tree = load(path)
     (edge,) = tree.edges()
     assert edge.samples == 1_200
     assert [x_of(tree, "a", "b", k) for k in (999, 1_100, 1_101)] == [999.0, 1_100.0, 1_101.0]
 
 
-def test_a_range_has_its_own_samples_and_the_static_ones_from_before(tmp_path: Path) -> None:
+def test_a_range_has_its_own_samples_and_the_static_ones_from_before(path: Path) -> None:
     lines = [
         (0, "/tf_static", [static("b", "fixed", 5.0)]),
         *((time, "/tf", [moving("a", "b", time + 1_000, float(time))]) for time in range(10, 60, 10)),
     ]
-    tree = load(write_mcap(tmp_path / "run.mcap", lines), 20, 40)
+    tree = load(write_mcap(path, lines), 20, 40)
     (edge, fixed) = tree.edges()
     assert (edge.child, edge.samples, edge.oldest, edge.newest) == ("b", 3, 1_020, 1_040)
     assert fixed.static
     assert x_of(tree, "a", "fixed", 1_030) == 35.0
 
 
-def test_a_loop_of_parents_is_left_out_and_the_rest_of_its_message_is_not(tmp_path: Path) -> None:
+def test_a_loop_of_parents_is_left_out_and_the_rest_of_its_message_is_not(path: Path) -> None:
     lines = [(1, "/tf", [moving("a", "b", 1)]), (2, "/tf", [moving("b", "a", 2), moving("a", "c", 2, 7.0)])]
     problems: Counter[str] = Counter()
-    tree = load(write_mcap(tmp_path / "run.mcap", lines), problems=problems)
+    tree = load(write_mcap(path, lines), problems=problems)
     assert problems == {"cycle": 1}
     assert tree.chain("c", "b") == ["c", "a", "b"]
     assert tree.frames() == ["a", "b", "c"]
     assert x_of(tree, "a", "c") == 7.0
 
 
-def test_one_message_may_reverse_an_edge(tmp_path: Path) -> None:
+def test_one_message_may_reverse_an_edge(path: Path) -> None:
     lines = [
         (1, "/tf", [moving("map", "a", 1), moving("a", "b", 1)]),
         (2, "/tf", [moving("b", "a", 2), moving("map", "b", 2)]),
     ]
     problems: Counter[str] = Counter()
-    tree = load(write_mcap(tmp_path / "run.mcap", lines), problems=problems)
+    tree = load(write_mcap(path, lines), problems=problems)
     assert problems == {}
     assert tree.chain("map", "a") == ["map", "b", "a"]
 
@@ -187,16 +192,14 @@ def test_the_tree_has_the_samples_that_a_bus_would_accept(
     assert tree.to_yaml() == buffer.tree.to_yaml()
 
 
-def test_without_a_counter_the_problems_are_logged_in_one_line(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_a_counter_the_problems_are_logged_in_one_line(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     load(SMALL)
     (record,) = caplog.records
     assert record.getMessage().startswith(f"left out of {SMALL}: 3 x not finite, 2 x frame name, ")
     caplog.clear()
     problems = Counter({"cycle": 10})
     load(SMALL, problems=problems)
-    load(write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("a", "b", 1)])]))
+    load(write_mcap(path, [(1, "/tf", [moving("a", "b", 1)])]))
     assert (problems["cycle"], caplog.records) == (11, [])
 
 
@@ -227,10 +230,10 @@ def test_the_details_of_damaged_messages_are_kept_up_to_a_number() -> None:
     assert problems.details == [f"number {number}" for number in range(MAX_DETAILS)]
 
 
-def test_a_frame_has_the_parent_of_each_time(tmp_path: Path) -> None:
+def test_a_frame_has_the_parent_of_each_time(path: Path) -> None:
     lines: list[Line] = [(time, "/tf", [moving("a" if time < 5 else "z", "b", time)]) for time in range(10)]
     lines.insert(0, (0, "/tf_static", [static("root", "a"), static("root", "z")]))
-    tree = load(write_mcap(tmp_path / "run.mcap", lines))
+    tree = load(write_mcap(path, lines))
     assert (tree.parent("b", 3), tree.parent("b", 7)) == ("a", "z")
 
 
@@ -247,18 +250,18 @@ def test_a_translation_that_is_not_physical_is_left_out_unless_the_bound_is_rais
         load(path, max_translation=0.0)
 
 
-def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(tmp_path: Path) -> None:
+def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(path: Path) -> None:
     lines = [(10 * k, moving("a", "b", 10 * k, float(k))) for k in range(2_000)]
     # The same instant again: the sample that comes later counts.
     lines.insert(1_500, (14_990, moving("a", "b", 14_990, -1.0)))
     # Beyond the bound, each along another axis, and each in another block.
     for place, far in ((1_950, (1e13, 0.0, 0.0)), (1_600, (0.0, 1e13, 0.0)), (1_300, (0.0, 0.0, 1e13))):
         lines.insert(place, (10 * place - 10, TransformStamped("a", "b", 10 * place - 5, Transform(far))))
-    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
+    with closing(McapOutput(str(path), overwrite=True)) as output:
         output.write([(received, (sample,)) for received, sample in lines])
         output.finish()
     problems: Counter[str] = Counter()
-    tree = load(tmp_path / "run.mcap", problems=problems)
+    tree = load(path, problems=problems)
     assert problems == {"not physical": 3}
     (edge,) = tree.edges()
     assert (edge.samples, edge.oldest, edge.newest) == (2_000, 0, 19_990)

@@ -51,6 +51,12 @@ AS_FAST_AS_POSSIBLE = math.inf
 START = 1_700_000_000 * SECOND
 
 
+@pytest.fixture
+def bus() -> Iterator[Bus]:
+    with Bus(SimulatedClock()) as bus:
+        yield bus
+
+
 def write_recording(path: Path, *entries: TimedBatch) -> Path:
     """A recording with batches at log times."""
     with closing(McapOutput(str(path), overwrite=True)) as output:
@@ -139,13 +145,12 @@ async def test_a_simulated_clock_goes_from_message_to_message(tmp_path: Path) ->
     assert clock.now() == START + 3_600 * SECOND + SECOND // 2
 
 
-async def test_messages_out_of_order_do_not_turn_the_clock_back(tmp_path: Path) -> None:
+async def test_messages_out_of_order_do_not_turn_the_clock_back(bus: Bus, tmp_path: Path) -> None:
     lines = [(received, "/tf", [moving("map", "base", received)]) for received in (5, 3, 9)]
     path = write_mcap(tmp_path / "run.mcap", lines, finish=False)
-    with Bus(SimulatedClock()) as bus:
-        heard = Listener(bus)
-        await Player(bus, path, rate=AS_FAST_AS_POSSIBLE).play()
-        assert bus.statistics().clock_resets == 0
+    heard = Listener(bus)
+    await Player(bus, path, rate=AS_FAST_AS_POSSIBLE).play()
+    assert bus.statistics().clock_resets == 0
     assert [now for now, _ in heard.entries] == [5, 5, 9]
 
 
@@ -361,28 +366,26 @@ async def test_a_seek_interrupts_a_pause_of_an_hour(tmp_path: Path, simulated: b
     assert player.passes == 1
 
 
-async def test_a_seek_before_it_plays_is_where_it_begins_once(tmp_path: Path) -> None:
+async def test_a_seek_before_it_plays_is_where_it_begins_once(bus: Bus, tmp_path: Path) -> None:
     entries = drive(range(5))
     path = write_recording(tmp_path / "run.mcap", *entries)
-    with Bus(SimulatedClock()) as bus:
-        heard = Listener(bus)
-        player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE)
-        player.seek(START + 3 * SECOND)
-        await player.play()
-        await player.play()
+    heard = Listener(bus)
+    player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE)
+    player.seek(START + 3 * SECOND)
+    await player.play()
+    await player.play()
     assert heard.entries == [*entries[3:], *entries]
 
 
-async def test_a_seek_behind_the_end_does_not_end_a_loop(tmp_path: Path) -> None:
+async def test_a_seek_behind_the_end_does_not_end_a_loop(bus: Bus, tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive(range(5)))
-    with Bus(SimulatedClock()) as bus:
-        heard = Listener(bus)
-        player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE, loop=True)
-        player.seek(START + 3_600 * SECOND)
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(player.play)
-            await heard.until(10)
-            tasks.cancel_scope.cancel()
+    heard = Listener(bus)
+    player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE, loop=True)
+    player.seek(START + 3_600 * SECOND)
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(player.play)
+        await heard.until(10)
+        tasks.cancel_scope.cancel()
     assert player.passes >= 2
 
 
@@ -621,38 +624,35 @@ async def test_the_topics_that_are_chosen_are_played(
     assert [sample.child for batch in heard.batches for sample in batch] == children
 
 
-async def test_problems_in_a_recording_are_counted_and_the_rest_is_played() -> None:
-    with Bus(SimulatedClock()) as bus:
-        player = Player(bus, SMALL, rate=AS_FAST_AS_POSSIBLE)
-        await player.play()
-        statistics = bus.statistics()
+async def test_problems_in_a_recording_are_counted_and_the_rest_is_played(bus: Bus) -> None:
+    player = Player(bus, SMALL, rate=AS_FAST_AS_POSSIBLE)
+    await player.play()
+    statistics = bus.statistics()
     # The loop of parents only the bus can see.
     assert {**player.bad, **statistics.rejected} == WRONG_IN_SMALL
     assert player.played == statistics.samples + WRONG_IN_SMALL["cycle"]
 
 
-async def test_the_readable_part_of_a_damaged_file_is_played(tmp_path: Path) -> None:
+async def test_the_readable_part_of_a_damaged_file_is_played(bus: Bus, tmp_path: Path) -> None:
     entries = drive(k / 100 for k in range(2_000))
     path = write_recording(tmp_path / "run.mcap", *entries)
     data = bytearray(path.read_bytes()[:-10_000])
     data[len(data) // 2] ^= 255
     path.write_bytes(data)
-    with Bus(SimulatedClock()) as bus:
-        heard = Listener(bus)
-        player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE)
-        await player.play()
+    heard = Listener(bus)
+    player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE)
+    await player.play()
     assert player.bad == {"damaged": 1, "unfinished": 1}
     assert heard.entries == [(now, (message,)) for now, (message,) in entries if (now, (message,)) in heard.entries]
     assert entries[0] == heard.entries[0]
     assert 500 < len(heard.entries) < 2_000
 
 
-async def test_a_played_recording_can_be_recorded_again(tmp_path: Path) -> None:
+async def test_a_played_recording_can_be_recorded_again(bus: Bus, tmp_path: Path) -> None:
     entries = [(START, (static("base", "rig", authority="survey"),)), *drive(k / 50 for k in range(500))]
     path, copy = write_recording(tmp_path / "run.mcap", *entries), tmp_path / "copy.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, copy):
-            await Player(bus, path, rate=AS_FAST_AS_POSSIBLE).play()
+    async with Recorder(bus, copy):
+        await Player(bus, path, rate=AS_FAST_AS_POSSIBLE).play()
     assert batches_in(copy) == batches_in(path)
 
 
@@ -741,8 +741,8 @@ async def test_an_invalid_file_raises_recording_error_each_time(tmp_path: Path) 
         ({"rate": "2"}, TypeError, "must be a number"),
         ({"since": 1.5}, TypeError, "from_seconds"),
         ({"since": 5, "until": 4}, ValueError, "end before it begins"),
-        ({"topics": ["/tf"], "namespaces": True}, ValueError, ""),
-        ({"prefix": "/r1"}, ValueError, ""),
+        ({"topics": ["/tf"], "namespaces": True}, ValueError, "."),
+        ({"prefix": "/r1"}, ValueError, "."),
     ],
 )
 def test_wrong_options_are_refused_at_once(options: dict[str, Any], error: type[Exception], why: str) -> None:
@@ -799,17 +799,16 @@ async def test_recorded_stamps_are_not_compared_with_the_clock(tmp_path: Path) -
         assert (bus.statistics().samples, bus.statistics().rejected) == (1, {})
 
 
-async def test_a_step_may_go_to_the_last_stamp(tmp_path: Path) -> None:
+async def test_a_step_may_go_to_the_last_stamp(bus: Bus, tmp_path: Path) -> None:
     path = write_mcap(
         tmp_path / "run.mcap",
         [(time, "/tf", [moving("map", "base", number)]) for number, time in enumerate((0, STAMP_MAX))],
     )
-    with Bus(SimulatedClock()) as bus:
-        player = Player(bus, path)
-        for _ in range(2):
-            player.step()
-        await player.play()
-        assert (player.position, player.played, bus.clock.now()) == (STAMP_MAX, 2, STAMP_MAX)
+    player = Player(bus, path)
+    for _ in range(2):
+        player.step()
+    await player.play()
+    assert (player.position, player.played, bus.clock.now()) == (STAMP_MAX, 2, STAMP_MAX)
 
 
 @pytest.mark.every_loop

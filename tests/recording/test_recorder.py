@@ -54,6 +54,17 @@ PATIENCE = 60.0
 """Real seconds after which a test that hangs is given up."""
 
 
+@pytest.fixture
+def bus() -> Iterator[Bus]:
+    with Bus(SimulatedClock()) as bus:
+        yield bus
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
 def recorded(path: Path) -> list[tuple[int, tuple[TransformStamped, ...]]]:
     """The times and batches in a file in which nothing is wrong."""
     with open_recording(path) as recording:
@@ -124,8 +135,7 @@ def pipe(tmp_path: Path) -> Iterator[Pipe]:
         yield pipe
 
 
-async def test_latched_samples_come_before_published_ones(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+async def test_latched_samples_come_before_published_ones(path: Path) -> None:
     clock = SimulatedClock(7 * SECOND)
     with Bus(clock) as bus:
         bus.publish(
@@ -146,8 +156,7 @@ async def test_latched_samples_come_before_published_ones(tmp_path: Path) -> Non
     ]
 
 
-async def test_a_batch_is_recorded_under_the_simulated_time_of_its_publication(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+async def test_a_batch_is_recorded_under_the_simulated_time_of_its_publication(path: Path) -> None:
     clock = SimulatedClock()
     with Bus(clock) as bus:
         broadcaster = TransformBroadcaster(bus, authority="odometry")
@@ -199,47 +208,42 @@ def test_a_loaded_recording_gives_the_answers_that_the_buffer_gave(
     assert answers(load(path), range(7)) == before
 
 
-async def test_two_recorders_of_one_bus_write_the_same(tmp_path: Path) -> None:
+async def test_two_recorders_of_one_bus_write_the_same(bus: Bus, tmp_path: Path) -> None:
     one, two = tmp_path / "one.mcap", tmp_path / "two.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, one), Recorder(bus, str(two)):
-            for sample in noise(3_000):
-                bus.publish(sample)
+    async with Recorder(bus, one), Recorder(bus, str(two)):
+        for sample in noise(3_000):
+            bus.publish(sample)
     assert one.read_bytes() == two.read_bytes()
     assert len(recorded(one)) == 3_000
 
 
-async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, path) as recorder:
-            for number in range(1, 4):
-                bus.publish(moving("map", "a", number))
-                await recorder.flush()
-                assert (recorder.statistics().samples, recorder.statistics().queue.pending) == (number, 0)
-                with open_recording(path) as recording:
-                    *messages, unfinished = recording.messages()
-                    assert len(messages) == number
-                    assert [error.reason for error in unfinished.errors] == ["unfinished"]
-                    assert not recording.finished
-        await recorder.flush()
-
-
-async def test_a_flush_writes_all_that_is_pending_in_whatever_parts(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, path) as recorder:
-            # So many are written at once, and a quarter of them more.
-            for number in range(5_120):
-                bus.publish(moving("map", "a", number))
+async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path) as recorder:
+        for number in range(1, 4):
+            bus.publish(moving("map", "a", number))
             await recorder.flush()
-            assert recorder.statistics().queue.pending == 0
+            assert (recorder.statistics().samples, recorder.statistics().queue.pending) == (number, 0)
             with open_recording(path) as recording:
-                # And the report that the file is not finished.
-                assert sum(map(len, recording.blocks())) == 5_120 + 1
+                *messages, unfinished = recording.messages()
+                assert len(messages) == number
+                assert [error.reason for error in unfinished.errors] == ["unfinished"]
+                assert not recording.finished
+    await recorder.flush()
 
 
-async def test_a_flush_does_not_wait_for_what_comes_meanwhile(tmp_path: Path) -> None:
+async def test_a_flush_writes_all_that_is_pending_in_whatever_parts(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path) as recorder:
+        # So many are written at once, and a quarter of them more.
+        for number in range(5_120):
+            bus.publish(moving("map", "a", number))
+        await recorder.flush()
+        assert recorder.statistics().queue.pending == 0
+        with open_recording(path) as recording:
+            # And the report that the file is not finished.
+            assert sum(map(len, recording.blocks())) == 5_120 + 1
+
+
+async def test_a_flush_does_not_wait_for_what_comes_meanwhile(path: Path) -> None:
     published: list[int] = []
 
     async def publish_without_end(bus: Bus) -> None:
@@ -249,7 +253,7 @@ async def test_a_flush_does_not_wait_for_what_comes_meanwhile(tmp_path: Path) ->
             await anyio.lowlevel.checkpoint()
 
     with Bus(SimulatedClock()) as bus, anyio.fail_after(PATIENCE):
-        async with Recorder(bus, tmp_path / "run.mcap") as recorder, anyio.create_task_group() as tasks:
+        async with Recorder(bus, path) as recorder, anyio.create_task_group() as tasks:
             tasks.start_soon(publish_without_end, bus)
             while len(published) < 100:
                 await anyio.lowlevel.checkpoint()
@@ -259,40 +263,35 @@ async def test_a_flush_does_not_wait_for_what_comes_meanwhile(tmp_path: Path) ->
             assert recorder.statistics().samples >= before
 
 
-async def test_what_a_message_cannot_hold_is_counted_and_not_pending(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, path) as recorder:
-            # A stamp of ROS has 31 bits for the seconds.
-            bus.publish([moving("map", "a", 2**31 * SECOND), moving("map", "b", 2**31 * SECOND - 1)])
-            await recorder.flush()
-            statistics = recorder.statistics()
+async def test_what_a_message_cannot_hold_is_counted_and_not_pending(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path) as recorder:
+        # A stamp of ROS has 31 bits for the seconds.
+        bus.publish([moving("map", "a", 2**31 * SECOND), moving("map", "b", 2**31 * SECOND - 1)])
+        await recorder.flush()
+        statistics = recorder.statistics()
     assert (statistics.samples, statistics.messages, sum(statistics.refused.values())) == (1, 1, 1)
     assert (statistics.queue.pending, offered(statistics)) == (0, 2)
 
 
-async def test_several_tasks_may_wait_for_a_flush(tmp_path: Path) -> None:
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, tmp_path / "run.mcap") as recorder, anyio.create_task_group() as tasks:
-            bus.publish(moving("map", "a", 1))
-            asked = [Asked(tasks, recorder.flush) for _ in range(3)]
-            await until(lambda: all(each.ended for each in asked))
-            assert recorder.statistics().samples == 1
+async def test_several_tasks_may_wait_for_a_flush(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path) as recorder, anyio.create_task_group() as tasks:
+        bus.publish(moving("map", "a", 1))
+        asked = [Asked(tasks, recorder.flush) for _ in range(3)]
+        await until(lambda: all(each.ended for each in asked))
+        assert recorder.statistics().samples == 1
 
 
-async def test_a_few_samples_are_written_soon_without_a_flush(tmp_path: Path) -> None:
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
-            # The second one comes when a chunk has just ended, and nothing comes behind it.
-            for number in (1, 2):
-                bus.publish(moving("map", "a", number))
-                assert recorder.statistics().queue.pending == 1
-                await until(lambda number=number: recorder.statistics().samples == number)  # type: ignore[misc]
+async def test_a_few_samples_are_written_soon_without_a_flush(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path) as recorder:
+        # The second one comes when a chunk has just ended, and nothing comes behind it.
+        for number in (1, 2):
+            bus.publish(moving("map", "a", number))
+            assert recorder.statistics().queue.pending == 1
+            await until(lambda number=number: recorder.statistics().samples == number)  # type: ignore[misc]
 
 
 @pytest.mark.thorough
-async def test_samples_faster_than_the_disk_are_recorded_or_counted_as_dropped(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+async def test_samples_faster_than_the_disk_are_recorded_or_counted_as_dropped(path: Path) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         bus.publish(static("map", "rig"))
         async with Recorder(bus, path, capacity=4_000) as recorder:
@@ -321,11 +320,11 @@ async def test_samples_faster_than_the_disk_are_recorded_or_counted_as_dropped(t
     ]
 
 
-async def test_each_time_that_dropping_begins_there_is_one_event(tmp_path: Path) -> None:
+async def test_each_time_that_dropping_begins_there_is_one_event(path: Path) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         # Also if something is pending from the beginning on.
         bus.publish(static("map", "rig"))
-        async with Recorder(bus, tmp_path / "run.mcap", capacity=10) as recorder:
+        async with Recorder(bus, path, capacity=10) as recorder:
             for _ in range(2):
                 for sample in noise(15):
                     bus.publish(sample)
@@ -355,7 +354,7 @@ async def test_a_disk_that_hangs_does_not_block_publishers(pipe: Pipe) -> None:
     assert statistics.samples == pipe.messages()
 
 
-async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_file(pipe: Pipe) -> None:
+async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_file(bus: Bus, pipe: Pipe) -> None:
     recorders = []
 
     async def record(bus: Bus) -> None:
@@ -370,18 +369,16 @@ async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_
             pipe.drain()
             await anyio.sleep_forever()
 
-    with Bus(SimulatedClock()) as bus:
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(record, bus)
-        # It hears of nothing any more.
-        bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(record, bus)
+    # It hears of nothing any more.
+    bus.publish(moving("map", "a", 1))
     (recorder,) = recorders
     assert offered(recorder.statistics()) == recorder.statistics().samples == 6_000
     assert pipe.messages() == 6_000
 
 
-async def test_an_error_of_the_body_is_raised_as_it_is_and_the_file_is_whole(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+async def test_an_error_of_the_body_is_raised_as_it_is_and_the_file_is_whole(path: Path) -> None:
     with Bus(SimulatedClock()) as bus, pytest.raises(LookupError, match="the body's own"):
         async with Recorder(bus, path):
             bus.publish(moving("map", "a", 1))
@@ -433,9 +430,8 @@ def cut(path: Path) -> None:
 )
 @pytest.mark.parametrize("more", [True, False])
 async def test_a_file_that_is_removed_replaced_or_cut_meanwhile_ends_the_recording(
-    tmp_path: Path, harm: Callable[[Path], None], why: str, more: bool
+    path: Path, harm: Callable[[Path], None], why: str, more: bool
 ) -> None:
-    path = tmp_path / "run.mcap"
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         async with Recorder(bus, path) as recorder:
             bus.publish(moving("map", "a", 1))
@@ -455,19 +451,18 @@ async def test_a_file_that_is_removed_replaced_or_cut_meanwhile_ends_the_recordi
 
 @pytest.mark.parametrize("move", [True, False])
 async def test_a_file_that_is_moved_is_finished_and_told_and_another_working_directory_is_no_harm(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, move: bool
+    bus: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, move: bool
 ) -> None:
     monkeypatch.chdir(tmp_path)
     path, moved = tmp_path / "run.mcap", tmp_path / "moved.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, "run.mcap") as recorder:
-            bus.publish(moving("map", "a", 1))
-            await recorder.flush()
-            if move:
-                await anyio.to_thread.run_sync(path.replace, moved)
-            else:
-                monkeypatch.chdir("/")
-            bus.publish(moving("map", "a", 2))
+    async with Recorder(bus, "run.mcap") as recorder:
+        bus.publish(moving("map", "a", 1))
+        await recorder.flush()
+        if move:
+            await anyio.to_thread.run_sync(path.replace, moved)
+        else:
+            monkeypatch.chdir("/")
+        bus.publish(moving("map", "a", 2))
     assert ("somebody moved the file" in str(recorder.error)) == move
     assert recorder.statistics().samples == len(recorded(moved if move else path)) == 2
 
@@ -482,18 +477,17 @@ async def test_a_disk_that_fails_at_the_end_causes_an_event_and_raises_nothing(p
     assert isinstance(recorder.error, BrokenPipeError)
 
 
-async def test_flush_returns_when_the_disk_fails(pipe: Pipe) -> None:
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, pipe.path, overwrite=True) as recorder:
-            pipe.break_off()
-            for stamp in range(5_000):
-                bus.publish(moving("map", "a", stamp))
-            with anyio.fail_after(PATIENCE):
-                await recorder.flush()
-            assert isinstance(recorder.error, BrokenPipeError)
-        queue = recorder.statistics().queue
-        # Also what was not passed to the disk yet.
-        assert (queue.pending, queue.dropped) == (0, 5_000)
+async def test_flush_returns_when_the_disk_fails(bus: Bus, pipe: Pipe) -> None:
+    async with Recorder(bus, pipe.path, overwrite=True) as recorder:
+        pipe.break_off()
+        for stamp in range(5_000):
+            bus.publish(moving("map", "a", stamp))
+        with anyio.fail_after(PATIENCE):
+            await recorder.flush()
+        assert isinstance(recorder.error, BrokenPipeError)
+    queue = recorder.statistics().queue
+    # Also what was not passed to the disk yet.
+    assert (queue.pending, queue.dropped) == (0, 5_000)
 
 
 FULL_DISK = """
@@ -520,8 +514,7 @@ anyio.run(main, backend=sys.argv[2])
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_samples_written_before_the_disk_was_full_can_be_read(tmp_path: Path, backend: str) -> None:
-    path = tmp_path / "run.mcap"
+def test_samples_written_before_the_disk_was_full_can_be_read(path: Path, backend: str) -> None:
     done = subprocess.run(
         [sys.executable, "-c", FULL_DISK, path, backend], capture_output=True, text=True, timeout=PATIENCE, check=True
     )
@@ -562,8 +555,7 @@ anyio.run(main, backend=sys.argv[2])
 @pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 @pytest.mark.parametrize("lines", [1, 3])
-def test_all_samples_but_the_last_ones_can_be_read_after_sigkill(tmp_path: Path, backend: str, lines: int) -> None:
-    path = tmp_path / "run.mcap"
+def test_all_samples_but_the_last_ones_can_be_read_after_sigkill(path: Path, backend: str, lines: int) -> None:
     command = [sys.executable, "-c", KILLED, str(path), backend]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -583,8 +575,7 @@ def test_all_samples_but_the_last_ones_can_be_read_after_sigkill(tmp_path: Path,
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_ctrl_c_leaves_a_whole_file(tmp_path: Path, backend: str) -> None:
-    path = tmp_path / "run.mcap"
+def test_ctrl_c_leaves_a_whole_file(path: Path, backend: str) -> None:
     command = [sys.executable, "-c", KILLED, str(path), backend]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -596,80 +587,73 @@ def test_ctrl_c_leaves_a_whole_file(tmp_path: Path, backend: str) -> None:
     assert [batch[0].stamp for _, batch in recorded(path)][:written] == list(range(written))
 
 
-async def test_an_existing_file_is_kept(tmp_path: Path) -> None:
+async def test_an_existing_file_is_kept(bus: Bus, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
-    with Bus(SimulatedClock()) as bus:
-        recorder = Recorder(bus, path)
-        with pytest.raises(FileExistsError):
-            await recorder.__aenter__()
-        bus.publish(moving("map", "a", 1))
-        assert offered(recorder.statistics()) == 0
-        assert path.read_text() == "precious"
-        async with Recorder(bus, path, overwrite=True):
-            bus.publish(moving("map", "a", 2))
+    recorder = Recorder(bus, path)
+    with pytest.raises(FileExistsError):
+        await recorder.__aenter__()
+    bus.publish(moving("map", "a", 1))
+    assert offered(recorder.statistics()) == 0
+    assert path.read_text() == "precious"
+    async with Recorder(bus, path, overwrite=True):
+        bus.publish(moving("map", "a", 2))
     assert len(recorded(path)) == 1
 
 
-async def test_a_recorder_that_cannot_start_raises(tmp_path: Path) -> None:
+async def test_a_recorder_that_cannot_start_raises(bus: Bus, tmp_path: Path, path: Path) -> None:
     full = tmp_path / "full.mcap"
     full.symlink_to("/dev/full")
-    with Bus(SimulatedClock()) as bus:
-        with pytest.raises(FileNotFoundError):
-            async with Recorder(bus, tmp_path / "nowhere" / "run.mcap"):
-                raise AssertionError("not reached")
-        with pytest.raises(OSError, match="No space"):
-            async with Recorder(bus, full, overwrite=True):
-                raise AssertionError("not reached")
-        bus.close()
-        with pytest.raises(BusClosedError):
-            async with Recorder(bus, tmp_path / "run.mcap"):
-                raise AssertionError("not reached")
+    with pytest.raises(FileNotFoundError):
+        async with Recorder(bus, tmp_path / "nowhere" / "run.mcap"):
+            raise AssertionError("not reached")
+    with pytest.raises(OSError, match="No space"):
+        async with Recorder(bus, full, overwrite=True):
+            raise AssertionError("not reached")
+    bus.close()
+    with pytest.raises(BusClosedError):
+        async with Recorder(bus, path):
+            raise AssertionError("not reached")
     assert not (tmp_path / "run.mcap").exists()
 
 
-async def test_a_recorder_cancelled_while_opening_its_file_leaves_nothing_behind(tmp_path: Path) -> None:
+async def test_a_recorder_cancelled_while_opening_its_file_leaves_nothing_behind(bus: Bus, tmp_path: Path) -> None:
     path = tmp_path / "pipe.mcap"
     os.mkfifo(path)
-    with Bus(SimulatedClock()) as bus:
-        recorder = Recorder(bus, path, overwrite=True)
-        async with anyio.create_task_group() as tasks:
-            asked = Asked(tasks, recorder.__aenter__)
-            await settle()
-            asked.cancel()
-            await settle()
-            # A pipe opens when there is a reader.
-            assert not asked.ended
-            data = await anyio.to_thread.run_sync(path.read_bytes)
-        assert asked.cancelled
-        bus.publish(moving("map", "a", 1))
+    recorder = Recorder(bus, path, overwrite=True)
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, recorder.__aenter__)
+        await settle()
+        asked.cancel()
+        await settle()
+        # A pipe opens when there is a reader.
+        assert not asked.ended
+        data = await anyio.to_thread.run_sync(path.read_bytes)
+    assert asked.cancelled
+    bus.publish(moving("map", "a", 1))
     assert offered(recorder.statistics()) == 0
     assert list(make_reader(BytesIO(data)).iter_messages()) == []
 
 
-async def test_a_recorder_is_entered_only_once_and_before_flush(tmp_path: Path) -> None:
-    with Bus(SimulatedClock()) as bus:
-        recorder = Recorder(bus, tmp_path / "run.mcap")
-        with pytest.raises(RuntimeError, match="enter the recorder first"):
-            await recorder.flush()
-        async with recorder:
-            with pytest.raises(RuntimeError, match="entered once"):
-                await recorder.__aenter__()
-        with pytest.raises(ValueError, match="capacity"):
-            Recorder(bus, tmp_path / "other.mcap", capacity=0)
+async def test_a_recorder_is_entered_only_once_and_before_flush(bus: Bus, tmp_path: Path, path: Path) -> None:
+    recorder = Recorder(bus, path)
+    with pytest.raises(RuntimeError, match="enter the recorder first"):
+        await recorder.flush()
+    async with recorder:
+        with pytest.raises(RuntimeError, match="entered once"):
+            await recorder.__aenter__()
+    with pytest.raises(ValueError, match="capacity"):
+        Recorder(bus, tmp_path / "other.mcap", capacity=0)
 
 
-async def test_a_bus_that_is_closed_in_the_body_ends_nothing_else(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, path):
-            bus.publish(moving("map", "a", 1))
-            bus.close()
+async def test_a_bus_that_is_closed_in_the_body_ends_nothing_else(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path):
+        bus.publish(moving("map", "a", 1))
+        bus.close()
     assert len(recorded(path)) == 1
 
 
-async def test_after_a_jump_back_of_the_clock_the_times_in_the_file_go_back_too(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+async def test_after_a_jump_back_of_the_clock_the_times_in_the_file_go_back_too(path: Path) -> None:
     clock = SimulatedClock(9 * SECOND)
     with Bus(clock) as bus:
         async with Recorder(bus, path) as recorder:
@@ -682,8 +666,7 @@ async def test_after_a_jump_back_of_the_clock_the_times_in_the_file_go_back_too(
     assert times == [9 * SECOND, 5 * SECOND]
 
 
-def test_under_plain_asyncio_a_timeout_leaves_a_whole_file(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_under_plain_asyncio_a_timeout_leaves_a_whole_file(path: Path) -> None:
 
     async def record(bus: Bus, started: asyncio.Event) -> None:
         async with Recorder(bus, path):
@@ -707,8 +690,8 @@ def test_under_plain_asyncio_a_timeout_leaves_a_whole_file(tmp_path: Path) -> No
     assert len(recorded(path)) == 5_000
 
 
-def test_a_recorder_that_has_not_begun_has_a_name_and_counts_nothing(tmp_path: Path) -> None:
-    recorder = Recorder(Bus(), tmp_path / "run.mcap", capacity=7)
+def test_a_recorder_that_has_not_begun_has_a_name_and_counts_nothing(tmp_path: Path, path: Path) -> None:
+    recorder = Recorder(Bus(), path, capacity=7)
     assert repr(recorder) == f"<Recorder of {str(tmp_path / 'run.mcap')!r}: 0 samples>"
     queue = QueueStatistics("recording", "drop_oldest", 7, 0, 0)
     assert recorder.statistics() == RecorderStatistics(0, 0, 0, {}, queue)

@@ -18,21 +18,18 @@ from support.recorded import SMALL, WRONG_IN_SMALL, Line, messages_in, real, wri
 from support.samples import any_samples, moving, static
 
 from tfbus import SECOND, TransformStamped
-from tfbus.recording import (
-    FrameSummary,
-    RecordedMessage,
-    RecordingSummary,
-    examine,
-    load,
-    open_recording,
-    summarise,
-)
+from tfbus.recording import FrameSummary, RecordedMessage, RecordingSummary, examine, load, open_recording, summarise
 from tfbus.recording.formats.mcap_output import McapOutput
 from tfbus.recording.summary import Durations, Periods
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tf_message import encode
 
 MS = 1_000_000
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
 
 
 def summary_of(path: Path) -> RecordingSummary:
@@ -109,9 +106,9 @@ def test_a_frame_with_static_and_moving_samples_has_both_kinds(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("kinds", ["ms", "sm", "ss", "mm", "mss", "smm"])
-def test_samples_of_each_kind_are_counted_in_whatever_block_they_come(tmp_path: Path, kinds: str) -> None:
+def test_samples_of_each_kind_are_counted_in_whatever_block_they_come(path: Path, kinds: str) -> None:
     samples = [static("a", "b") if kind == "s" else moving("a", "b", at) for at, kind in enumerate(kinds)]
-    frames = {each.frame: each for each in summary_of(write_blocks(tmp_path / "run.mcap", sent(samples))).frames}
+    frames = {each.frame: each for each in summary_of(write_blocks(path, sent(samples))).frames}
     assert (frames["b"].static, frames["b"].moving) == (kinds.count("s"), kinds.count("m"))
 
 
@@ -219,18 +216,18 @@ def test_the_summary_of_a_real_robot() -> None:
     assert {frame.moving for frame in summary.frames if frame.moving} == {153}
 
 
-def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(tmp_path: Path) -> None:
+def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(path: Path) -> None:
     # 4,000 samples at 100 Hz, each received 3 ms after its stamp, but for the last: 5 ms, from another sender.
     lines = [(10 * MS * k + 3 * MS, moving("a", "b", 10 * MS * k, float(k), "one")) for k in range(3_999)]
     lines.append((39_990 * MS + 5 * MS, moving("a", "b", 39_990 * MS, 0.0, "two")))
     # A late sample of another parent leaves the newest edge as it is, so the next one closes no loop.
     lines.append((40_000 * MS, moving("c", "b", 39_985 * MS, 0.0, "one")))
     lines.append((40_001 * MS, moving("b", "c", 40_001 * MS, 0.0, "three")))
-    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
+    with closing(McapOutput(str(path), overwrite=True)) as output:
         output.write([(received, (sample,)) for received, sample in lines])
         output.finish()
     counted: list[int] = []
-    with open_recording(tmp_path / "run.mcap") as recording:
+    with open_recording(path) as recording:
         summary = summarise(recording, progress=counted.append)
         one_by_one = summarise(recording, recording.messages())
     # The first one names the frame, the last one has to be judged.
@@ -343,7 +340,7 @@ def test_the_periods_are_those_of_all_different_stamps(columns: list[list[int]])
     assert spread.p99 == pytest.approx(sorted(differences)[-(-99 * len(differences) // 100) - 1], rel=0.0101)
 
 
-def test_a_recording_is_examined_as_it_arrived_with_the_norms_as_they_were_sent(tmp_path: Path) -> None:
+def test_a_recording_is_examined_as_it_arrived_with_the_norms_as_they_were_sent(path: Path) -> None:
     uneven = bytearray(encode([moving("odom", "base", 3 * SECOND)]))
     uneven[-8:] = struct.pack("<d", 1.005)
     lines: list[Line] = [
@@ -353,7 +350,7 @@ def test_a_recording_is_examined_as_it_arrived_with_the_norms_as_they_were_sent(
         (5 * SECOND, "/tf", b"nonsense"),
     ]
     blocks: list[int] = []
-    with open_recording(write_mcap(tmp_path / "run.mcap", lines)) as recording:
+    with open_recording(write_mcap(path, lines)) as recording:
         found = [
             (each.kind, each.frame, each.count, each.first, each.worst)
             for each in examine(recording, progress=blocks.append)

@@ -481,10 +481,7 @@ def test_the_whole_part_of_a_torn_chunk_is_read(write: Write) -> None:
 
 @pytest.mark.parametrize(
     ("part", "says"),
-    [
-        (b"/tf_static", "topic /tg_static"),
-        (b"tf2_msgs/msg/TFMessage", "of type tg2_msgs/msg/TFMessage"),
-    ],
+    [(b"/tf_static", "topic /tg_static"), (b"tf2_msgs/msg/TFMessage", "of type tg2_msgs/msg/TFMessage")],
 )
 def test_a_name_in_the_index_that_no_longer_is_one_of_transforms_is_mentioned(
     write: Write, part: bytes, says: str

@@ -20,15 +20,14 @@ from support.strategies import samples
 
 from tfbus import Transform, TransformStamped
 from tfbus.bus.queues import TimedBatch
-from tfbus.recording.formats.mcap_output import (
-    CHUNK_SIZE,
-    SCHEMA,
-    SCHEMA_NAME,
-    TYPE_HASH,
-    McapOutput,
-)
+from tfbus.recording.formats.mcap_output import CHUNK_SIZE, SCHEMA, SCHEMA_NAME, TYPE_HASH, McapOutput
 from tfbus.stamps import SECOND
 from tfbus.tf_message import decode
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
 
 
 def written(path: Path, *entries: TimedBatch) -> McapOutput:
@@ -62,8 +61,7 @@ def test_the_schema_is_the_definition_that_ros_2_has() -> None:
     assert store.hash_rihs01(SCHEMA_NAME) == TYPE_HASH
 
 
-def test_the_official_reader_reads_topics_times_and_transforms(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_the_official_reader_reads_topics_times_and_transforms(path: Path) -> None:
     turned = TransformStamped("map", "b", 12 * SECOND + 7, Transform((1.0, 2.0, 3.0), (0.0, 0.6, 0.0, 0.8)), "slam")
     written(path, (5, (static("map", "c", x=3.0),)), (9, (moving("map", "a", 3, x=0.1), turned)))
     with path.open("rb") as file:
@@ -84,8 +82,7 @@ def test_the_official_reader_reads_topics_times_and_transforms(tmp_path: Path) -
     assert decode(found[1][6]).samples == [moving("map", "a", 3, x=0.1), plain(turned)]
 
 
-def test_a_batch_of_both_kinds_is_a_message_on_each_topic(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_a_batch_of_both_kinds_is_a_message_on_each_topic(path: Path) -> None:
     written(path, (5, (moving("map", "a", 1), static("a", "b"), moving("a", "c", 2), static("a", "d"))))
     with Reader(path) as reader:
         found = {each.topic: (time, decode(raw).samples) for each, time, raw in reader.messages()}
@@ -95,8 +92,7 @@ def test_a_batch_of_both_kinds_is_a_message_on_each_topic(tmp_path: Path) -> Non
     }
 
 
-def test_a_child_that_changes_its_kind_within_a_batch_has_the_last_one(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_a_child_that_changes_its_kind_within_a_batch_has_the_last_one(path: Path) -> None:
     written(path, (5, (moving("map", "a", 1), static("map", "b"), static("map", "a"), moving("map", "b", 2))))
     with Reader(path) as reader:
         assert [(each.topic, decode(raw).samples) for each, _, raw in reader.messages()] == [
@@ -121,8 +117,7 @@ def test_transforms_come_back_bit_for_bit(tmp_path: Path, batch: list[TransformS
     assert output.samples == len(batch)
 
 
-def test_samples_that_a_message_cannot_hold_are_counted_by_reason(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_samples_that_a_message_cannot_hold_are_counted_by_reason(path: Path) -> None:
     late, long = moving("map", "a", 2**31 * SECOND), moving("map", "a" * 2_000, 1)
     output = written(path, (5, (late, moving("map", "b", 1), long)), (6, (late,)))
     with Reader(path) as reader:
@@ -131,8 +126,7 @@ def test_samples_that_a_message_cannot_hold_are_counted_by_reason(tmp_path: Path
     assert (output.samples, output.messages) == (1, 1)
 
 
-def test_an_instant_before_1970_is_recorded_as_1970(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_an_instant_before_1970_is_recorded_as_1970(path: Path) -> None:
     written(path, (-5, (moving("map", "a", -5),)))
     with Reader(path) as reader:
         assert [(time, decode(raw).samples) for _, time, raw in reader.messages()] == [(0, [moving("map", "a", -5)])]
@@ -150,8 +144,7 @@ def authorities_in(path: Path) -> list[tuple[str | None, list[str]]]:
         ]
 
 
-def test_the_channel_of_a_message_has_its_authorities(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_the_channel_of_a_message_has_its_authorities(path: Path) -> None:
     a, b, c = (moving("map", child, 1, authority=who) for child, who in (("a", "x"), ("b", "x"), ("c", "y")))
     written(path, (1, (a,)), (2, (a, b)), (3, (a, b, c)), (4, (moving("map", "d", 1),)))
     assert authorities_in(path) == [
@@ -163,8 +156,7 @@ def test_the_channel_of_a_message_has_its_authorities(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("runs", [32, 33])
-def test_a_message_with_too_many_authorities_is_split(tmp_path: Path, runs: int) -> None:
-    path = tmp_path / "run.mcap"
+def test_a_message_with_too_many_authorities_is_split(path: Path, runs: int) -> None:
     crowd = tuple(moving("map", f"f{number}", 1, authority=f"a{number // 2}") for number in range(2 * runs))
     output = written(path, (1, crowd))
     if runs == 32:
@@ -177,8 +169,7 @@ def test_a_message_with_too_many_authorities_is_split(tmp_path: Path, runs: int)
     assert (output.samples, output.unattributed) == (2 * runs, 0)
 
 
-def test_with_a_thousand_authorities_the_rest_is_recorded_without_and_counted(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_with_a_thousand_authorities_the_rest_is_recorded_without_and_counted(path: Path) -> None:
     output = written(path, *((k, (moving("map", "a", k, authority=f"a{k}"),)) for k in range(1_010)))
     told = [authorities for authorities, _ in authorities_in(path)]
     assert told == [f'[["a{k}", 1]]' for k in range(1_000)] + [None] * 10
@@ -194,8 +185,7 @@ def test_with_a_thousand_authorities_the_rest_is_recorded_without_and_counted(tm
     ]
 
 
-def test_the_quality_of_service_is_that_of_tf2s_broadcasters(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_the_quality_of_service_is_that_of_tf2s_broadcasters(path: Path) -> None:
     written(path, (5, (moving("map", "a", 1), static("a", "b"))))
     with path.open("rb") as file:
         channels = {channel.topic: channel.metadata for _, channel, _ in make_reader(file).iter_messages()}
@@ -208,8 +198,7 @@ def test_the_quality_of_service_is_that_of_tf2s_broadcasters(tmp_path: Path) -> 
         assert (offered.reliability, offered.durability) == (QosReliability.RELIABLE, durability)
 
 
-def test_samples_counted_as_written_can_be_read_at_any_moment(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_samples_counted_as_written_can_be_read_at_any_moment(path: Path) -> None:
     seen = set()
     with closing(McapOutput(str(path), overwrite=False)) as output:
         for k in range(2_000):

@@ -43,6 +43,11 @@ from tfbus.tf_message import encode
 SECOND = 1_000_000_000
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.bag"
+
+
 def test_a_bag_tells_its_ends_its_count_and_who_sent_what() -> None:
     with Reader(SMALL) as reader:
         count = reader.message_count
@@ -124,9 +129,8 @@ COMPRESSIONS = [None, *Writer.CompressionFormat]
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_all_messages_are_read_with_an_index_and_without(
-    tmp_path: Path, compression: Writer.CompressionFormat | None
+    path: Path, compression: Writer.CompressionFormat | None
 ) -> None:
-    path = tmp_path / "run.bag"
     data = write_bag(path, compression=compression)
     assert read(path) == (EXPECTED, [])
     with open_recording(path) as recording:
@@ -138,8 +142,7 @@ def test_all_messages_are_read_with_an_index_and_without(
         assert facts(recording) == (10, 159, 61, False)
 
 
-def test_a_finished_bag_without_messages_is_an_empty_recording(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
+def test_a_finished_bag_without_messages_is_an_empty_recording(path: Path) -> None:
     data = bytearray(unfinished())
     place = data.index(b"index_pos=") + 10
     # Its index is behind the header at the earliest.
@@ -159,9 +162,8 @@ def test_a_finished_bag_without_messages_is_an_empty_recording(tmp_path: Path) -
     "compression", [None, *(pytest.param(kind, marks=pytest.mark.thorough) for kind in Writer.CompressionFormat)]
 )
 def test_a_bag_cut_at_any_byte_gives_the_messages_before_the_cut(
-    tmp_path: Path, compression: Writer.CompressionFormat | None
+    path: Path, compression: Writer.CompressionFormat | None
 ) -> None:
-    path = tmp_path / "run.bag"
     data = write_bag(path, LINES[:12], compression, chunk=600)
     counts = []
     for size in range(20, len(data), 29):
@@ -201,8 +203,7 @@ def test_the_last_chunk_of_a_writer_that_was_killed_is_read(
     assert read(path) == (EXPECTED, [])
 
 
-def test_behind_a_damaged_record_reading_goes_on_with_the_next_chunk(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
+def test_behind_a_damaged_record_reading_goes_on_with_the_next_chunk(path: Path) -> None:
     data = bytearray(write_bag(path))
     second, third = chunks_in(bytes(data))[1:3]
     # The length of the header of a message in the second chunk.
@@ -216,8 +217,7 @@ def test_behind_a_damaged_record_reading_goes_on_with_the_next_chunk(tmp_path: P
 
 
 @pytest.mark.parametrize("indexed", [True, False])
-def test_a_damaged_chunk_header_loses_one_chunk(tmp_path: Path, indexed: bool) -> None:
-    path = tmp_path / "run.bag"
+def test_a_damaged_chunk_header_loses_one_chunk(path: Path, indexed: bool) -> None:
     data = bytearray(write_bag(path))
     second, third = chunks_in(bytes(data))[1:3]
     data[second + 3] ^= 0x40
@@ -229,8 +229,7 @@ def test_a_damaged_chunk_header_loses_one_chunk(tmp_path: Path, indexed: bool) -
     assert (f"the chunk at byte {second}: " if indexed else f"from byte {second} to byte {third}") in lost[0]
 
 
-def test_a_chunk_that_claims_to_hold_those_behind_it_hides_none_of_them(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
+def test_a_chunk_that_claims_to_hold_those_behind_it_hides_none_of_them(path: Path) -> None:
     data = bytearray(write_bag(path))
     second, third = chunks_in(bytes(data))[1:3]
     with path.open("rb") as file:
@@ -244,8 +243,7 @@ def test_a_chunk_that_claims_to_hold_those_behind_it_hides_none_of_them(tmp_path
     assert f"nothing can be read from byte {second} to byte {third}: a chunk claims {size:,} bytes" in lost[0]
 
 
-def test_a_chunk_that_claims_too_much_is_not_unfolded(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
+def test_a_chunk_that_claims_too_much_is_not_unfolded(path: Path) -> None:
     data = bytearray(write_bag(path, compression=Writer.CompressionFormat.BZ2))
     with path.open("rb") as file:
         first = read_record(file, find_chunk(file, 13) or 0)
@@ -257,8 +255,7 @@ def test_a_chunk_that_claims_too_much_is_not_unfolded(tmp_path: Path) -> None:
     assert "claims 314,572,800 bytes, and 268,435,456 is the bound" in lost[0]
 
 
-def test_an_index_is_used_up_to_its_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "run.bag"
+def test_an_index_is_used_up_to_its_bound(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = write_bag(path)
     size = len(data) - int.from_bytes(data[data.index(b"index_pos=") + 10 :][:8], "little")
     for bound, finished in ((size, True), (size - 1, False)):
@@ -288,45 +285,42 @@ def stored_in(path: Path, *records: bytes, **limits: int) -> tuple[list[tuple[in
         storage.close()
 
 
-def test_the_topic_of_a_connection_is_that_of_its_record_or_else_that_of_its_description(tmp_path: Path) -> None:
+def test_the_topic_of_a_connection_is_that_of_its_record_or_else_that_of_its_description(path: Path) -> None:
     # The second one is that to which the recorder subscribed.
     content = connection(0, b"/tf", topic=b"/mapped", **TF) + connection(1, None, topic=b"/other", **TF)
     content += message(0, 1, b"x") + message(1, 2, b"y")
-    assert stored_in(tmp_path / "run.bag", chunk(content)) == ([(1, "/tf", b"x"), (2, "/other", b"y")], [])
+    assert stored_in(path, chunk(content)) == ([(1, "/tf", b"x"), (2, "/other", b"y")], [])
 
 
-def test_messages_on_connections_that_are_not_described_are_counted(tmp_path: Path) -> None:
+def test_messages_on_connections_that_are_not_described_are_counted(path: Path) -> None:
     content = connection(3, b"/tf", **TF) + b"".join(message(number, number, b"x") for number in (1, 2, 3, 4))
-    found, lost = stored_in(tmp_path / "run.bag", chunk(content), chunk(message(1, 5, b"y")))
+    found, lost = stored_in(path, chunk(content), chunk(message(1, 5, b"y")))
     assert found == [(3, "/tf", b"x")]
     assert lost == ["4 messages are on connections that the file does not describe"]
 
 
 @pytest.mark.parametrize("other", [connection(3, b"/tf2", **TF), connection(3, b"/tf", type=b"std_msgs/String")])
-def test_descriptions_that_contradict_each_other_are_told_and_the_first_one_holds(tmp_path: Path, other: bytes) -> None:
+def test_descriptions_that_contradict_each_other_are_told_and_the_first_one_holds(path: Path, other: bytes) -> None:
     one = connection(3, b"/tf", **TF)
     again = connection(3, b"/tf", **{**TF, "callerid": b"/other"})
-    assert stored_in(tmp_path / "run.bag", chunk(one + again + message(3, 1, b"x"))) == ([(1, "/tf", b"x")], [])
-    found, lost = stored_in(tmp_path / "run.bag", chunk(one + other + message(3, 1, b"x")))
+    assert stored_in(path, chunk(one + again + message(3, 1, b"x"))) == ([(1, "/tf", b"x")], [])
+    found, lost = stored_in(path, chunk(one + other + message(3, 1, b"x")))
     assert found == [(1, "/tf", b"x")]
     assert lost == ["the descriptions of connection 3 contradict each other"]
 
 
-def test_a_range_of_a_bag_without_an_index_includes_both_ends(tmp_path: Path) -> None:
+def test_a_range_of_a_bag_without_an_index_includes_both_ends(path: Path) -> None:
     described = chunk(connection(0, b"/tf", **TF))
     chunks = [chunk(message(0, begin, b"x") + message(0, begin + 1, b"y")) for begin in (10, 20, 30)]
     for first, last in ((11, 30), (12, 29), (20, 21), (21, 21), (22, 29)):
-        found, lost = stored_in(
-            tmp_path / "run.bag", described, *chunks, since=first * SECOND + 5, until=last * SECOND + 5
-        )
+        found, lost = stored_in(path, described, *chunks, since=first * SECOND + 5, until=last * SECOND + 5)
         assert [second for second, _, _ in found] == [
             second for second in (10, 11, 20, 21, 30, 31) if first <= second <= last
         ]
         assert lost == []
 
 
-def test_damage_between_the_chunks_is_told_at_the_start_of_the_recording_or_of_the_range(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
+def test_damage_between_the_chunks_is_told_at_the_start_of_the_recording_or_of_the_range(path: Path) -> None:
     one = chunk(connection(0, b"/tf", **TF) + message(0, 7, b""))
     path.write_bytes(unfinished(b"\xff" * 40, one))
     for since, told in ((None, 7 * SECOND + 5), (0, 7 * SECOND + 5), (9 * SECOND, 9 * SECOND)):
@@ -344,8 +338,7 @@ def test_damage_between_the_chunks_is_told_at_the_start_of_the_recording_or_of_t
         assert stored_in(path, one, rest) == ([(7, "/tf", b"")], [])
 
 
-def test_a_chunk_of_which_nothing_can_be_read_changes_neither_start_nor_end(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
+def test_a_chunk_of_which_nothing_can_be_read_changes_neither_start_nor_end(path: Path) -> None:
     damaged = chunk(b"\xff" * 50)
     described = connection(0, b"/tf", **TF)
     first, second = (chunk(described + message(0, seconds, write_ros1([]))) for seconds in (7, 9))
@@ -367,8 +360,7 @@ def test_a_chunk_of_which_nothing_can_be_read_changes_neither_start_nor_end(tmp_
     assert raised.value.reason == "damaged"
 
 
-def test_the_indexes_behind_the_chunks_tell_how_many_messages_there_are(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
+def test_the_indexes_behind_the_chunks_tell_how_many_messages_there_are(path: Path) -> None:
     described = connection(0, b"/tf", **TF) + connection(1, b"/other", type=b"a/B")
     first = chunk(described + message(0, 1, b"x") + message(1, 2, b"y") + message(0, 3, b"z"))
     second = chunk(message(0, 8, b"x") + message(0, 9, b"x"))
