@@ -26,7 +26,6 @@ from support.samples import moving, static
 from tfbus import RecordingError
 from tfbus.recording import Conversion, Edits, convert, load, open_recording
 from tfbus.recording.formats.copies import (
-    FRAME_TRANSFORMS,
     BagCopy,
     CannotWriteError,
     FoxgloveCopy,
@@ -399,14 +398,6 @@ def test_a_link_that_somebody_has_made_beside_the_output_leads_nowhere(tmp_path:
 SLASHED = RawTransform(1, 2, b"/odom", b"/base", bytes(56))
 
 
-def test_without_edits_nothing_changes_not_even_a_leading_slash() -> None:
-    assert Edits() == Edits(frames=None, rename={}, prefix="", drop_static=False)
-    assert Edits().apply(SLASHED) == SLASHED
-    assert not Edits().changes_messages
-    assert not Edits(drop_static=True).changes_messages
-    assert Edits(frames=()).changes_messages
-
-
 def test_names_are_compared_without_their_slashes() -> None:
     assert Edits(rename={"base": "body"}).apply(SLASHED)[2:4] == (b"/odom", b"body")
     assert Edits(prefix="r/").apply(SLASHED)[2:4] == (b"r/odom", b"r/base")
@@ -448,17 +439,6 @@ def test_times_before_1970_are_refused_where_a_format_has_none(tmp_path: Path) -
             copy.write(TF_CHANNEL, -1, PAYLOAD)
         # 1970 begins with 0.
         copy.write(TF_CHANNEL, 0, PAYLOAD)
-        copy.close()
-
-
-def test_a_copy_holds_transforms_in_its_own_encoding(tmp_path: Path) -> None:
-    pytest.importorskip("foxglove")
-    ros1, json_ = Channel("/tf", "tf2_msgs/TFMessage", "ros1"), Channel("/tf", FRAME_TRANSFORMS, "json")
-    foxglove, other = (Channel("/tf", kind, "protobuf") for kind in (FRAME_TRANSFORMS, "foxglove.FrameTransform"))
-    channels = (TF_CHANNEL, ros1, json_, foxglove, other)
-    for kind, held in ((McapCopy, channels), (BagCopy, [ros1]), (SqliteCopy, [TF_CHANNEL]), (FoxgloveCopy, [foxglove])):
-        copy = kind(tmp_path / "run", "run")
-        assert [channel for channel in channels if copy.holds(channel)] == list(held)
         copy.close()
 
 

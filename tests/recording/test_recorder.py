@@ -1,8 +1,6 @@
 """A bus is recorded: in order, within bounds, and whole whatever happens."""
 
 import asyncio
-import errno
-import json
 import os
 import random
 import signal
@@ -19,7 +17,7 @@ import anyio
 import anyio.from_thread
 import anyio.to_thread
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from support.asking import Asked, settle
@@ -27,7 +25,6 @@ from support.samples import any_samples, moving, static
 
 from tfbus import (
     SECOND,
-    Buffer,
     Bus,
     BusClosedError,
     Event,
@@ -37,12 +34,8 @@ from tfbus import (
     RecordingFailed,
     SimulatedClock,
     Transform,
-    TransformBroadcaster,
-    TransformError,
     TransformStamped,
-    TransformTree,
 )
-from tfbus.recording.load import load
 from tfbus.recording.recorder import Recorder, WriteQueue
 from tfbus.recording.recording import open_recording
 
@@ -154,67 +147,6 @@ async def test_latched_samples_come_before_published_ones(path: Path) -> None:
         (9 * SECOND, (static("b", "d", authority="survey"),)),
         (9 * SECOND, (moving("a", "b", 3, authority="odometry"),)),
     ]
-
-
-async def test_a_batch_is_recorded_under_the_simulated_time_of_its_publication(path: Path) -> None:
-    clock = SimulatedClock()
-    with Bus(clock) as bus:
-        broadcaster = TransformBroadcaster(bus, authority="odometry")
-
-        async def drive() -> None:
-            async for tick in clock.ticks(100.0):
-                broadcaster.send("map", "base", Transform((tick / 100, 0.0, 0.0)), at=7)
-
-        async with Recorder(bus, path), anyio.create_task_group() as tasks:
-            tasks.start_soon(drive)
-            await clock.advance(2.0)
-            tasks.cancel_scope.cancel()
-    assert [received for received, _ in recorded(path)] == [tick * SECOND // 100 for tick in range(201)]
-
-
-def answers(tree: TransformTree, stamps: range) -> list[str]:
-    """Everything that can be asked of a tree, to the last bit; where there is no answer, why."""
-    found = []
-    for target in sorted(tree.frames()):
-        for source in sorted(tree.frames()):
-            for stamp in stamps:
-                try:
-                    found.append(repr(tree.lookup(target, source, stamp)))
-                except TransformError as error:
-                    found.append(f"{target} {source} {stamp}: {error}")
-    return found
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(st.lists(any_samples("abcd", 5), min_size=1, max_size=4), max_size=12))
-@pytest.mark.thorough
-def test_a_loaded_recording_gives_the_answers_that_the_buffer_gave(
-    run: Run, tmp_path: Path, batches: list[list[TransformStamped]]
-) -> None:
-    path = tmp_path / "run.mcap"
-
-    async def record() -> None:
-        with Bus(SimulatedClock()) as bus:
-            buffer = Buffer(bus, keep=None)
-            async with Recorder(bus, path, overwrite=True):
-                for batch in batches:
-                    # One by one, for a batch of both kinds is divided in the file, and then less can be judged at once.
-                    for sample in batch:
-                        bus.publish(sample, invalid="drop")
-            before.extend(answers(buffer.tree, range(7)))
-
-    before: list[str] = []
-    run(record)
-    assert answers(load(path), range(7)) == before
-
-
-async def test_two_recorders_of_one_bus_write_the_same(bus: Bus, tmp_path: Path) -> None:
-    one, two = tmp_path / "one.mcap", tmp_path / "two.mcap"
-    async with Recorder(bus, one), Recorder(bus, str(two)):
-        for sample in noise(3_000):
-            bus.publish(sample)
-    assert one.read_bytes() == two.read_bytes()
-    assert len(recorded(one)) == 3_000
 
 
 async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(bus: Bus, path: Path) -> None:
@@ -488,45 +420,6 @@ async def test_flush_returns_when_the_disk_fails(bus: Bus, pipe: Pipe) -> None:
     queue = recorder.statistics().queue
     # Also what was not passed to the disk yet.
     assert (queue.pending, queue.dropped) == (0, 5_000)
-
-
-FULL_DISK = """
-import json, resource, sys, anyio
-from tfbus import Bus, TransformBroadcaster, Transform
-from tfbus.recording.recorder import Recorder
-
-async def main():
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
-    with Bus() as bus:
-        broadcaster = TransformBroadcaster(bus)
-        async with Recorder(bus, sys.argv[1]) as recorder:
-            stamp = 0
-            while recorder.error is None:
-                stamp += 1
-                broadcaster.send("map", "base", Transform((1 / stamp, 2 / stamp, 3 / stamp)), at=stamp)
-                await anyio.sleep(0)
-        queue = recorder.statistics().queue
-        print(json.dumps([recorder.error.errno, recorder.statistics().samples, queue.dropped, stamp]))
-
-anyio.run(main, backend=sys.argv[2])
-"""
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_samples_written_before_the_disk_was_full_can_be_read(path: Path, backend: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, path, backend], capture_output=True, text=True, timeout=PATIENCE, check=True
-    )
-    code, samples, dropped, published = json.loads(done.stdout)
-    assert code == errno.EFBIG
-    assert samples > 0
-    assert samples + dropped == published
-    with open_recording(path) as recording:
-        stamps = [sample.stamp for message in recording.messages() for sample in message.batch]
-    # The chunk that did not fit may be whole, and only what belongs to it is missing.
-    assert samples <= len(stamps) < published
-    assert stamps == list(range(1, len(stamps) + 1))
 
 
 KILLED = """

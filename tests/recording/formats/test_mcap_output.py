@@ -1,6 +1,5 @@
 """The MCAP files that a recorder writes, read by others."""
 
-from collections import Counter
 from contextlib import closing
 from pathlib import Path
 
@@ -115,15 +114,6 @@ def test_transforms_come_back_bit_for_bit(tmp_path: Path, batch: list[TransformS
     assert found["/tf"] == [repr(plain(sample)) for sample in batch if not sample.static]
     assert found["/tf_static"] == [repr(plain(sample)) for sample in batch if sample.static]
     assert output.samples == len(batch)
-
-
-def test_samples_that_a_message_cannot_hold_are_counted_by_reason(path: Path) -> None:
-    late, long = moving("map", "a", 2**31 * SECOND), moving("map", "a" * 2_000, 1)
-    output = written(path, (5, (late, moving("map", "b", 1), long)), (6, (late,)))
-    with Reader(path) as reader:
-        assert [(time, decode(raw).samples) for _, time, raw in reader.messages()] == [(5, [moving("map", "b", 1)])]
-    assert output.refused == Counter({"stamp": 2, "frame name": 1})
-    assert (output.samples, output.messages) == (1, 1)
 
 
 def test_an_instant_before_1970_is_recorded_as_1970(path: Path) -> None:

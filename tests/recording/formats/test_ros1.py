@@ -29,12 +29,10 @@ from tfbus.recording.formats.ros1 import (
     find_chunk,
     index_span,
     kind_of,
-    number_in,
     parse_fields,
     read_chunk,
     read_record,
     split_chunk,
-    time_in,
 )
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.formats.transforms import write_ros1
@@ -156,30 +154,6 @@ def test_a_finished_bag_without_messages_is_an_empty_recording(path: Path) -> No
         else:
             with pytest.raises(RecordingError, match="ends before its first message"):
                 open_recording(path)
-
-
-@pytest.mark.parametrize(
-    "compression", [None, *(pytest.param(kind, marks=pytest.mark.thorough) for kind in Writer.CompressionFormat)]
-)
-def test_a_bag_cut_at_any_byte_gives_the_messages_before_the_cut(
-    path: Path, compression: Writer.CompressionFormat | None
-) -> None:
-    data = write_bag(path, LINES[:12], compression, chunk=600)
-    counts = []
-    for size in range(20, len(data), 29):
-        path.write_bytes(data[:size])
-        try:
-            found, lost = read(path)
-        except RecordingError as error:
-            assert error.reason == "truncated"
-            found, lost = [], []
-        assert (found, lost) == (EXPECTED[: len(found)], [])
-        counts.append(len(found))
-    assert counts == sorted(counts)
-    assert counts[-1] == 12
-    if compression is None:
-        # Within the chunks, the messages come one by one.
-        assert set(range(13)) <= set(counts)
 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
@@ -505,19 +479,12 @@ def test_damage_is_an_error() -> None:
         read_record(io.BytesIO(CHUNK_RECORD[:10]), 0)
     with pytest.raises(ValueError, match="claims 4,294,967,295 bytes"):
         read_record(io.BytesIO(b"\xff" * 20), 0)
-    for call in (
-        lambda: parse_fields(b"\5\0\0\0abcde"),
-        lambda: parse_fields(b"\xff\0\0\0a=b"),
-        lambda: kind_of({b"op": b"\1"}),
-        lambda: kind_of({b"op": b"\x08"}),
-        lambda: kind_of({b"op": b""}),
-        lambda: kind_of({}),
-        lambda: number_in({b"conn": bytes(3)}, b"conn"),
-        lambda: number_in({b"conn": bytes(5)}, b"conn"),
-        lambda: time_in(b"1234567"),
-    ):
+    for fields in (b"\5\0\0\0abcde", b"\xff\0\0\0a=b"):
         with pytest.raises(DAMAGE):
-            call()
+            parse_fields(fields)
+    for kind in ({b"op": b"\1"}, {b"op": b"\x08"}, {b"op": b""}, {}):
+        with pytest.raises(DAMAGE):
+            kind_of(kind)
 
 
 def test_the_counts_of_an_index_are_read_as_far_as_they_go() -> None:

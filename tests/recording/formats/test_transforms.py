@@ -142,51 +142,22 @@ def test_the_seconds_that_the_stamp_of_an_encoding_holds_are_written(
         assert raised.value.reason == "stamp"
 
 
-def protobuf_schema() -> tuple[bytes, bytes]:
-    """The definition of ``foxglove.FrameTransforms``, and a message of it."""
-    pb2 = pytest.importorskip("google.protobuf.descriptor_pb2")
-    from google.protobuf import descriptor_pool, message_factory, timestamp_pb2
-
-    file = pb2.FileDescriptorProto(name="frames.proto", package="foxglove", syntax="proto3")
-    file.dependency.append("google/protobuf/timestamp.proto")
-    kind = pb2.FieldDescriptorProto
-    fields: dict[str, list[tuple[str, int, str]]] = {
-        "Vector3": [(axis, kind.TYPE_DOUBLE, "") for axis in "xyz"],
-        "Quaternion": [(axis, kind.TYPE_DOUBLE, "") for axis in "xyzw"],
-        "FrameTransform": [
-            ("timestamp", kind.TYPE_MESSAGE, ".google.protobuf.Timestamp"),
-            ("parent_frame_id", kind.TYPE_STRING, ""),
-            ("child_frame_id", kind.TYPE_STRING, ""),
-            ("translation", kind.TYPE_MESSAGE, ".foxglove.Vector3"),
-            ("rotation", kind.TYPE_MESSAGE, ".foxglove.Quaternion"),
-        ],
-        "FrameTransforms": [("transforms", kind.TYPE_MESSAGE, ".foxglove.FrameTransform")],
-    }
-    for name, parts in fields.items():
-        message = file.message_type.add(name=name)
-        for number, (part, type_, type_name) in enumerate(parts, 1):
-            label = kind.LABEL_REPEATED if part == "transforms" else kind.LABEL_OPTIONAL
-            message.field.add(name=part, number=number, type=type_, type_name=type_name or None, label=label)
-    pool = descriptor_pool.DescriptorPool()
-    timestamp = pb2.FileDescriptorProto()
-    timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
-    pool.Add(timestamp)
-    pool.Add(file)
-    content = message_factory.GetMessageClass(pool.FindMessageTypeByName("foxglove.FrameTransforms"))()
-    each = content.transforms.add(parent_frame_id="map", child_frame_id="base")
-    each.timestamp.seconds, each.timestamp.nanos = 5, 6
-    each.translation.x, each.translation.y, each.translation.z, each.rotation.w = 1, 2, 3, 1
-    return pb2.FileDescriptorSet(file=[timestamp, file]).SerializeToString(), content.SerializeToString()
-
-
 def test_protobuf_is_read_by_the_schema_in_the_file() -> None:
-    schema, payload = protobuf_schema()
-    assert parser_of(foxglove("protobuf", schema=schema))(payload) == [ONE]
+    foxglove_sdk = pytest.importorskip("foxglove.messages")
+    one = foxglove_sdk.FrameTransform(
+        timestamp=foxglove_sdk.Timestamp(5, 6),
+        parent_frame_id="map",
+        child_frame_id="base",
+        translation=foxglove_sdk.Vector3(x=1.0, y=2.0, z=3.0),
+        rotation=foxglove_sdk.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    payload, schema = foxglove_sdk.FrameTransforms(transforms=[one]).encode(), foxglove_sdk.FrameTransforms.get_schema()
+    assert parser_of(foxglove("protobuf", schema=schema.data))(payload) == [ONE]
     for wrong in (foxglove("protobuf"), foxglove("protobuf", schema=b"\xff" * 9)):
         with pytest.raises(MalformedMessageError):
             parser_of(wrong)(payload)
     with pytest.raises(MalformedMessageError):
-        parser_of(foxglove("protobuf", schema=schema))(b"\xff" * 20)
+        parser_of(foxglove("protobuf", schema=schema.data))(b"\xff" * 20)
 
 
 def test_of_a_long_text_the_error_shows_the_beginning() -> None:
@@ -216,29 +187,6 @@ BY_ODOMETRY = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr", metadata={"tfbus.a
 SAMPLES = [moving("odom", "base", 3, 1.5, "odometry"), moving("base", "wheel", 4, 2.5, "odometry")]
 PAYLOAD = encode(SAMPLES)
 BY_ROS_1 = bytes(get_typestore(Stores.ROS2_HUMBLE).cdr_to_ros1(PAYLOAD, "tf2_msgs/msg/TFMessage"))
-
-
-@pytest.mark.parametrize(
-    ("metadata", "authorities"),
-    [
-        ('[["x", 1]]', ["x", "x", "x"]),
-        ('[["x", 2], ["y", 1]]', ["x", "x", "y"]),
-        ('[["x", 1], ["y", 2]]', ["x", "y", "y"]),
-        ('[["x", 2], ["y", 2]]', ["", "", ""]),
-        ('[["x", 1], ["y", 1]]', ["", "", ""]),
-        ('[["x", 3], ["y", 0]]', ["", "", ""]),
-        ("[]", ["", "", ""]),
-    ],
-)
-def test_each_transform_has_the_authority_of_its_run_if_there_are_as_many_as_the_runs_have(
-    metadata: str, authorities: list[str]
-) -> None:
-    channel = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr", metadata={"tfbus.authorities": metadata})
-    decoder = ChannelDecoder(channel, static=True, prefix="r/")
-    samples = [static("map", name) for name in "abc"]
-    found = decoder.decode(encode(samples)).samples
-    assert found == [static("r/map", f"r/{name}", authority=who) for name, who in zip("abc", authorities, strict=True)]
-    assert [decoder.authority_of(place, 3) for place in range(3)] == authorities
 
 
 def test_a_refused_transform_stays_refused_under_a_prefix() -> None:
