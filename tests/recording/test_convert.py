@@ -406,7 +406,7 @@ def test_names_are_compared_without_their_slashes() -> None:
 
 
 def test_a_name_that_is_no_text_keeps_its_bytes() -> None:
-    broken = SLASHED._replace(child=b"\xffbase")
+    broken = RawTransform(1, 2, b"/odom", b"\xffbase", bytes(56))
     assert Edits(prefix="r/").apply(broken).child == b"r/\xffbase"
 
 

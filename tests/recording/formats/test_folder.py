@@ -167,15 +167,6 @@ def test_what_the_metadata_promise_of_topics_that_are_not_read_is_not_told(tmp_p
     assert batches_in(tmp_path) == EXPECTED
 
 
-def test_what_is_missing_of_several_files_is_told_behind_their_last_message(tmp_path: Path) -> None:
-    for part in range(2):
-        write_mcap(tmp_path / f"run_{part}.mcap", LINES[15 * part : 15 * part + 15])
-    metadata(tmp_path, "run_0.mcap", "run_1.mcap", count=31)
-    *_, last, lost = messages_in(tmp_path)
-    assert (last.received, lost.received) == (29, 29)
-    assert "promises 31 messages on '/tf', and 30 were found" in str(lost.errors[0])
-
-
 @pytest.mark.parametrize(
     ("text", "why"),
     [

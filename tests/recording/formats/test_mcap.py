@@ -172,11 +172,10 @@ def test_messages_are_ordered_by_log_time_wherever_they_are_in_the_file(
     lines = [(time, "/tf", [moving("a", "b", place)]) for place, time in enumerate(times)]
     path = write_mcap(tmp_path_factory.mktemp("recording") / "run.mcap", lines, chunk_size=chunk_size)
     by_time = sorted((time, place) for place, time in enumerate(times))
-    found = [(message.received, message.batch[0].stamp) for message in messages_in(path)]
-    assert found == by_time
-    since, until = ends
-    within = [(message.received, message.batch[0].stamp) for message in messages_in(path, since, until)]
-    assert within == [(time, place) for time, place in by_time if since <= time <= until]
+    for since, until in ((0, 30), ends):
+        expected = [(time, place) for time, place in by_time if since <= time <= until]
+        for messages in (messages_in(path, since, until), in_blocks(path, since, until)):
+            assert [(message.received, message.batch[0].stamp) for message in messages] == expected
 
 
 def test_only_the_chunks_of_the_range_are_read(write: Write) -> None:

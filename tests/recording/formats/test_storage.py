@@ -32,35 +32,12 @@ from tfbus.recording.formats.storage import (
     max_unpacked,
     merge_chunks,
     pack,
-    select,
-    separate,
     shortfalls,
     unfold,
     unfold_file,
 )
-from tfbus.stamps import STAMP_MAX
 
 TF, OTHER, STATIC = Channel("/tf", "", "cdr"), Channel("/tf", "", "cdr"), Channel("/tf_static", "", "cdr")
-BLOCKS: list[list[StoredMessage]] = [[(1, TF, b"a"), (2, STATIC, b"b")], [], [(3, TF, b"c"), (4, TF, b"d")]]
-
-
-def test_a_range_includes_both_ends_and_what_is_in_it_is_counted() -> None:
-    read: Counter[Channel] = Counter()
-    assert [stored[0] for stored in select(BLOCKS, 2, 3, read)] == [2, 3]
-    assert (read[TF], read[STATIC]) == (1, 1)
-    assert [stored[0] for stored in select(BLOCKS, None, None, Counter())] == [1, 2, 3, 4]
-
-
-def test_a_log_time_that_is_no_stamp_is_lost_at_the_start_of_the_range_or_behind_the_messages_of_its_block() -> None:
-    wrong: StoredMessage = (STAMP_MAX + 1, TF, b"")
-    cases: list[tuple[int | None, list[list[StoredMessage]], list[int]]] = [
-        (None, [[wrong]], [0]),
-        (5, [[wrong]], [5]),
-        (None, [[(7, TF, b""), (3, TF, b""), wrong]], [7, 3, 7]),
-        (None, [[(7, TF, b""), (9, TF, b"")], [wrong, (8, TF, b"")]], [7, 9, 9, 8]),
-    ]
-    for since, blocks, times in cases:
-        assert [received for received, _, _ in select(blocks, since, None, Counter())] == times
 
 
 def test_what_is_promised_is_compared_by_topic() -> None:
@@ -95,7 +72,7 @@ def test_packed_messages_are_those_that_were_packed_in_the_order_of_their_log_ti
 def test_a_log_time_that_is_no_stamp_comes_last_and_one_by_one() -> None:
     packed = pack([(5, A, b"x"), (3, B, b"y")])
     assert packed is not None
-    wrong = packed._replace(received=np.array([-1, 3]))
+    wrong = Packed(packed.data, packed.channels, packed.numbers, np.array([-1, 3]), packed.starts, packed.ends)
     assert list(in_order(wrong, 0, 9)) == [[(3, B, b"y"), (2**64 - 1, A, b"x")]]
 
 
@@ -135,20 +112,6 @@ def test_a_file_whose_chunks_overlap_is_packed_in_the_order_of_log_times(
 CHANNEL = Channel("/tf", "", "cdr")
 
 
-@given(chunks=st.lists(st.lists(st.integers(0, 20), min_size=1, max_size=5), max_size=8))
-def test_messages_come_by_log_time_and_those_of_one_time_in_the_order_of_the_file(chunks: list[list[int]]) -> None:
-    places = sorted(ChunkPlace(min(times), max(times), offset) for offset, times in enumerate(chunks))
-
-    def read(place: ChunkPlace) -> list[StoredMessage]:
-        return [(time, CHANNEL, b"%d %d" % (place.offset, at)) for at, time in enumerate(chunks[place.offset])]
-
-    found = [stored for block in merge_chunks(places, read) for stored in block]
-    assert found == sorted(
-        (stored for place in sorted(places, key=lambda place: place.offset) for stored in read(place)),
-        key=lambda stored: stored[0],
-    )
-
-
 @pytest.mark.parametrize(
     ("offsets", "blocks"),
     # In the order of the file, the messages at 5 of the first chunk come before those of the second.
@@ -166,25 +129,6 @@ def test_a_message_waits_for_the_next_chunk_only_if_one_of_that_may_come_before(
     places = [ChunkPlace(0, 5, offsets[0]), ChunkPlace(5, 9, offsets[1])]
     found = [(len(opened), [received for received, _, _ in block]) for block in merge_chunks(places, read)]
     assert found == blocks
-
-
-@pytest.mark.parametrize(
-    ("spans", "parts"),
-    [
-        ([], []),
-        ([(0, 5)], [1]),
-        ([(0, 5), (6, 9)], [1, 1]),
-        ([(0, 5), (5, 9)], [1, 1]),
-        ([(0, 6), (5, 9)], [2]),
-        ([(0, 9), (1, 2), (3, 4), (9, 12), (10, 11), (12, 13)], [3, 2, 1]),
-        ([(0, 0), (0, 0)], [1, 1]),
-    ],
-)
-def test_chunks_that_do_not_overlap_are_parts_of_an_index(spans: list[tuple[int, int]], parts: list[int]) -> None:
-    places = [ChunkPlace(*span, offset) for offset, span in enumerate(spans)]
-    found = separate(places)
-    assert [part.stop - part.start for part in found] == parts
-    assert [place for part in found for place in places[part]] == places
 
 
 DATA = bytes(range(256)) * 256
