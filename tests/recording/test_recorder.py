@@ -222,36 +222,6 @@ async def test_a_few_samples_are_written_soon_without_a_flush(bus: Bus, path: Pa
             await until(lambda number=number: recorder.statistics().samples == number)  # type: ignore[misc]
 
 
-@pytest.mark.thorough
-async def test_samples_faster_than_the_disk_are_recorded_or_counted_as_dropped(path: Path) -> None:
-    with Bus(SimulatedClock()) as bus, bus.events() as events:
-        bus.publish(static("map", "rig"))
-        async with Recorder(bus, path, capacity=4_000) as recorder:
-            for stamp in range(20_000):
-                # Nothing is awaited, so nothing can be written.
-                bus.publish((moving("map", "a", stamp),) if stamp % 2_000 else (static("map", f"s{stamp}"),))
-            statistics = recorder.statistics()
-            assert (statistics.samples, offered(statistics)) == (0, 20_001)
-            # The newest 4,000 batches, two of them static, and the nine static samples from before.
-            assert statistics.queue.pending == 4_009
-            assert recorder.bus is bus
-        statistics = recorder.statistics()
-        bus.close()
-        told = [event async for event in events if isinstance(event, RecordingDropped)]
-    assert statistics.queue.pending == 0
-    assert statistics.queue.dropped == 20_001 - 4_009
-    assert statistics.samples == 4_009 == sum(len(batch) for _, batch in recorded(path))
-    assert told == [RecordingDropped(0, str(path), 1)]
-    kept = [sample for _, batch in recorded(path) for sample in batch]
-    assert {sample.child for sample in kept if sample.static} == {
-        "rig",
-        *(f"s{2_000 * number}" for number in range(10)),
-    }
-    assert [sample.stamp for sample in kept if not sample.static] == [
-        stamp for stamp in range(16_000, 20_000) if stamp % 2_000
-    ]
-
-
 async def test_each_time_that_dropping_begins_there_is_one_event(path: Path) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         # Also if something is pending from the beginning on.

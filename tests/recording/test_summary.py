@@ -249,6 +249,8 @@ def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(path: Pa
 delays = st.lists(st.integers(-(10**15), 10**15), min_size=1, max_size=300)
 
 
+@example(parts=[[1] * 98, [2, 3]], singles=[])
+@example(parts=[[10**9] * 197 + [10**11] * 3], singles=[])
 @given(parts=st.lists(delays, min_size=1, max_size=3), singles=st.lists(st.integers(-(10**15), 10**15), max_size=3))
 def test_mean_and_maximum_are_exact_and_the_quantile_is_within_1_percent(
     parts: list[list[int]], singles: list[int]
@@ -269,17 +271,6 @@ def test_mean_and_maximum_are_exact_and_the_quantile_is_within_1_percent(
     exact = whole[-(-99 * len(whole) // 100) - 1] / SECOND
     assert spread.p99 == pytest.approx(exact, rel=0.0101, abs=1e-12)
     assert spread.p99 <= spread.max
-
-
-def test_two_of_two_hundred_are_beyond_the_quantile_and_three_are_not() -> None:
-    for late, p99 in ((2, 1.0), (3, 100.0)):
-        durations = Durations()
-        durations.add(np.array([SECOND] * (200 - late) + [100 * SECOND] * late))
-        spread = durations.spread()
-        assert spread is not None
-        # 99 % do not exceed it, so it is rounded up.
-        assert p99 <= spread.p99 <= p99 * 1.0101
-        assert spread.max == 100.0
 
 
 @pytest.mark.parametrize("at_once", [1, 999])

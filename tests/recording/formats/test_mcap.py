@@ -145,22 +145,6 @@ def test_a_message_whose_log_time_is_no_stamp_is_reported_and_the_others_are_rea
     assert len(found) == 3 + finish
 
 
-def test_messages_on_other_topics_or_of_other_types_are_ignored(write: Write) -> None:
-    other = [moving("x", "y", 0)]
-    lines = [
-        (5, "/camera", b"\xff" * 5_000),
-        *((6, topic, other) for topic in ("/robot1/tf", "/tf_old", "/tf/more", "//tf")),
-        (7, "tf", [moving("a", "b", 1)]),
-        (8, "tf_static", [static("b", "c")]),
-    ]
-    path = write(lines)
-    assert batches_in(path) == [(7, (moving("a", "b", 1),)), (8, (static("b", "c"),))]
-    with open_recording(path) as recording:
-        assert (recording.start, recording.count) == (5, 2)
-    assert batches_in(write(LINES, schema="sensor_msgs/msg/Image")) == []
-    assert batches_in(write(LINES, encoding="protobuf")) == []
-
-
 @given(
     times=st.lists(st.integers(0, 30), max_size=40),
     chunk_size=st.integers(1, 2_000),
