@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import zstandard
-from foxglove.messages import FrameTransform, FrameTransforms, Quaternion, Timestamp, Vector3
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -528,22 +527,6 @@ def test_the_definition_of_a_type_of_ros_2_has_the_digest_of_ros_1(kind: str, di
 CHANNEL = foxglove_channel(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"), {})
 
 numbers = st.lists(st.floats(), min_size=7, max_size=7).map(lambda values: struct.pack("<7d", *values))
-
-
-def test_the_bytes_are_those_of_foxglove_s_own_encoder() -> None:
-    theirs = FrameTransforms(
-        transforms=[
-            FrameTransform(
-                timestamp=Timestamp(1_700_000_000, 300),
-                parent_frame_id="map",
-                child_frame_id="base",
-                translation=Vector3(x=1.0, y=-2.0, z=0.1),
-                rotation=Quaternion(x=0.1, y=0.2, z=0.3, w=0.9),
-            )
-        ]
-    ).encode()
-    ours = RawTransform(1_700_000_000, 300, b"map", b"base", struct.pack("<7d", 1.0, -2.0, 0.1, 0.1, 0.2, 0.3, 0.9))
-    assert write_protobuf([ours]) == theirs
 
 
 def test_the_seconds_that_a_stamp_of_foxglove_holds_are_written() -> None:

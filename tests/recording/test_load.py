@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin
-from support.recorded import SMALL, WRONG_IN_SMALL, Line, answers, as_ros2, messages_in, real, write_mcap
+from support.recorded import SMALL, WRONG_IN_SMALL, Line, answers, as_ros2, write_mcap
 from support.samples import any_samples, moving, over, static, x_of
 
 from tfbus import (
@@ -90,39 +89,6 @@ def test_a_loaded_recording_gives_the_answers_of_tf2_in_every_format(tmp_path: P
     assert problems == WRONG_IN_SMALL
 
 
-@pytest.mark.thorough
-def test_the_kth_transform_of_a_turtle_is_its_kth_pose() -> None:
-    path = real("turtlesim.bag")
-    tree = load(path)
-    sent: dict[str, list[int]] = {"turtle1": [], "turtle2": []}
-    for message in messages_in(path):
-        for sample in message.batch:
-            if sample.child in sent:
-                sent[sample.child].append(sample.stamp)
-    with AnyReader([path]) as reader:
-        for turtle, stamps in sent.items():
-            topic = [connection for connection in reader.connections if connection.topic == f"/{turtle}/pose"]
-            poses: list[Any] = [reader.deserialize(raw, link.msgtype) for link, _, raw in reader.messages(topic)]
-            assert len(poses) == len(stamps) == 1344
-            assert sorted(set(stamps)) == stamps
-            for pose, stamp in zip(poses, stamps, strict=True):
-                found = tree.lookup("world", turtle, stamp).transform
-                assert found.translation == (pose.x, pose.y, 0.0)
-                half = pose.theta / 2
-                assert found.rotation == pytest.approx((0.0, 0.0, math.sin(half), math.cos(half)), abs=2e-16)
-    assert tree.lookup("turtle1", "carrot").static
-
-
-def test_the_pr2_has_all_its_frames() -> None:
-    problems: Counter[str] = Counter()
-    tree = load(real("pr2_tf.bag"), problems=problems)
-    edges = tree.edges()
-    assert len(edges) == 82
-    assert problems == {}
-    assert {edge.authority for edge in edges} == {"robot_state_publisher"}
-    tree.lookup("base_footprint", "l_gripper_tool_frame")
-
-
 def test_samples_are_kept_however_old_they_are(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", over("a", "b", (0, 1_000_000 * SECOND), speed=1e-9))])
     tree = load(path)
@@ -161,17 +127,6 @@ def test_a_loop_of_parents_is_left_out_and_the_rest_of_its_message_is_not(path: 
     assert tree.chain("c", "b") == ["c", "a", "b"]
     assert tree.frames() == ["a", "b", "c"]
     assert x_of(tree, "a", "c") == 7.0
-
-
-def test_one_message_may_reverse_an_edge(path: Path) -> None:
-    lines = [
-        (1, "/tf", [moving("map", "a", 1), moving("a", "b", 1)]),
-        (2, "/tf", [moving("b", "a", 2), moving("map", "b", 2)]),
-    ]
-    problems: Counter[str] = Counter()
-    tree = load(write_mcap(path, lines), problems=problems)
-    assert problems == {}
-    assert tree.chain("map", "a") == ["map", "b", "a"]
 
 
 @given(batches=st.lists(st.lists(any_samples("abcd", last=20), min_size=1, max_size=4), max_size=15))

@@ -260,19 +260,6 @@ async def test_on_a_clock_that_cannot_jump_looping_removes_moving_frames(tmp_pat
     assert expired == 0
 
 
-async def test_only_what_moves_later_than_where_it_begins_again_is_removed(tmp_path: Path) -> None:
-    one = drive((0.0,))
-    later = (START + SECOND, (static("map", "base"), moving("map", "arm", START + SECOND)))
-    for entries, expected in ((one, []), ([*one, later], ["arm"])):
-        path = write_recording(tmp_path / "run.mcap", *entries)
-        with Bus() as bus, bus.events(stale_after=None) as events:
-            player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE)
-            for _ in range(2):
-                await player.play()
-            bus.close()
-            assert [event.frame async for event in events if isinstance(event, FrameRemoved)] == expected
-
-
 async def test_a_frame_that_another_sends_again_is_not_removed_with_those_that_were_played(tmp_path: Path) -> None:
     arm = (START + 2 * SECOND, (moving("map", "arm", START + 2 * SECOND),))
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0)), arm)

@@ -193,23 +193,6 @@ def test_a_computed_column_cannot_claim_more_than_a_message_may_have(path: Path,
     assert (lost.received, promised.received) == (received, received)
 
 
-def test_what_cannot_be_read_is_told_behind_the_last_message_that_was(path: Path) -> None:
-    with write(path) as file:
-        file.execute("ALTER TABLE messages RENAME TO stored")
-        size = f"CASE WHEN timestamp < {256 + 7} THEN 1 ELSE {MAX_OTHER_MESSAGE + 1} END"
-        file.execute(f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data AS (zeroblob({size})))")
-        # So that they need not be sorted, for which all would be read.
-        file.execute("CREATE INDEX by_time ON messages(timestamp)")
-        for received in range(256 + 8):
-            file.execute("INSERT INTO messages(topic_id, timestamp) VALUES (2, ?)", (received,))
-    file.close()
-    *read, lost, promised = messages_in(path)
-    # SQLite's cursor is one row ahead.
-    assert [message.received for message in read] == list(range(256 + 6))
-    assert "nothing more can be read" in str(lost.errors[0])
-    assert (lost.received, promised.received) == (256 + 5, 256 + 5)
-
-
 def test_a_file_that_one_thread_has_opened_is_read_and_closed_by_another(path: Path) -> None:
     write(path).close()
     with ThreadPoolExecutor(1) as other:

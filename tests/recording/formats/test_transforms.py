@@ -30,7 +30,6 @@ from tfbus.tf_message import MalformedMessageError, encode
 NUMBERS = struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1)
 ONE = RawTransform(5, 6, b"map", b"base", NUMBERS)
 TWO = RawTransform(7, 8, b"base", b"camera1", struct.pack("<7d", 4, 5, 6, 0, 0, 1, 0))
-THIRD = RawTransform(9, 10, b"base", b"cam", struct.pack("<7d", 7, 8, 9, 0, 1, 0, 0))
 METADATA = {"tfbus.authorities": '[["odometry", 1], ["slam", 1]]'}
 CDR = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr", metadata=METADATA)
 ROS1 = Channel("/tf", "tf2_msgs/TFMessage", "ros1", metadata={"callerid": "/odometry"})
@@ -86,25 +85,6 @@ def test_foxglove_messages_of_ros_have_the_layout_of_ros() -> None:
         parser_of(many)(write_cdr([ONE]) + bytes(4))
     ros1 = struct.pack("<II", 5, 6) + b"\3\0\0\0map\4\0\0\0base" + NUMBERS
     assert parser_of(foxglove("ros1", "foxglove_msgs/FrameTransform"))(ros1) == [ONE]
-
-
-def in_ros1(transform: RawTransform) -> bytes:
-    seconds, nanoseconds, parent, child, numbers = transform
-    names = b"".join(struct.pack("<I", len(name)) + name for name in (parent, child))
-    return bytes(4) + struct.pack("<II", seconds, nanoseconds) + names + numbers
-
-
-def test_several_transforms_are_one_message_in_either_encoding() -> None:
-    ros1 = write_ros1([ONE, TWO, THIRD])
-    assert ros1 == b"\3\0\0\0" + in_ros1(ONE) + in_ros1(TWO) + in_ros1(THIRD)
-    assert parser_of(ROS1)(ros1) == [ONE, TWO, THIRD]
-    cdr = write_cdr([ONE, TWO, THIRD])
-    # Each string ends at a multiple of 4: the names at 32, 120 and 204, of which only the last is no multiple of 8.
-    first = struct.pack("<iI", 5, 6) + b"\4\0\0\0map\0" + b"\5\0\0\0base\0\0\0\0" + NUMBERS
-    second = struct.pack("<iI", 7, 8) + b"\5\0\0\0base\0\0\0\0" + b"\x08\0\0\0camera1\0" + TWO.numbers
-    third = struct.pack("<iI", 9, 10) + b"\5\0\0\0base\0\0\0\0" + b"\4\0\0\0cam\0" + bytes(4) + THIRD.numbers
-    assert cdr == b"\0\1\0\0\3\0\0\0" + first + second + third
-    assert parser_of(CDR)(cdr) == [ONE, TWO, THIRD]
 
 
 def test_cdr_is_read_in_either_byte_order_and_in_the_usual_one_bit_for_bit() -> None:
@@ -195,16 +175,6 @@ def test_a_refused_transform_stays_refused_under_a_prefix() -> None:
     found = ChannelDecoder(BY_ODOMETRY, static=False, prefix="r/").decode(payload)
     assert found.samples == [moving("r/map", "r/a", 1, authority="odometry"), None]
     assert [error.reason for error in found.errors] == ["not finite"]
-
-
-def test_in_the_other_byte_order_every_transform_has_its_authority_too() -> None:
-    # One transform, between frames with names of three letters, stamped 1 s and 2 ns, at x = 1 m.
-    name = b"\0\0\0\4abc\0", b"\0\0\0\4xyz\0"
-    numbers = struct.pack(">7d", 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    one = struct.pack(">iI", 1, 2) + b"".join(name)
-    payload = b"\0\0\0\0" + struct.pack(">I", 2) + one + b"\0" * 4 + numbers + one + numbers
-    found = ChannelDecoder(BY_ODOMETRY, static=False).decode(payload)
-    assert found.samples == [moving("abc", "xyz", 1_000_000_002, 1.0, "odometry")] * 2
 
 
 @pytest.mark.parametrize("channel", [BY_ODOMETRY, ROS1])
