@@ -164,6 +164,10 @@ def test_what_a_format_cannot_hold_is_left_out_and_counted(tmp_path: Path, path:
     unknown = write_mcap(tmp_path / "unknown.mcap", [(1, "/a", b"\0\1\0\0")], schema="my_msgs/msg/Thing")
     done = convert([unknown], tmp_path / "unknown.bag")
     assert (done.messages, done.problems) == (0, {"type": 1})
+    for schema, definition in (("Thing", b""), ("my_msgs/msg/Thing", b"\xff{{")):
+        write_mcap(unknown, [(1, "/a", b"\0\1\0\0")], schema=schema, definition=definition)
+        done = convert([unknown], tmp_path / "unknown.bag", overwrite=True)
+        assert (done.messages, done.problems) == (0, {"type": 1})
 
 
 def test_what_the_recorder_has_compressed_is_unfolded_and_what_only_looks_like_it_is_not(tmp_path: Path) -> None:
