@@ -1,5 +1,10 @@
+"""A recording becomes another one, in another format or with edits."""
+
+import json
 import sqlite3
 import struct
+import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +16,29 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 from support.processes import is_open
-from support.recorded import SMALL, Line, batches_in, messages_in, sender_of, write_mcap
+from support.recorded import SMALL, Line, batches_in, messages_in, write_mcap
 from support.samples import moving, static
 
 from tfbus import RecordingError
 from tfbus.recording import Conversion, Edits, convert, load, open_recording
+from tfbus.recording.formats.copies import (
+    BagCopy,
+    CannotWriteError,
+    FoxgloveCopy,
+    McapCopy,
+    MessageTypes,
+    SqliteCopy,
+    foxglove_channel,
+    write_protobuf,
+)
+from tfbus.recording.formats.mcap_output import TYPE_HASH
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.formats.transforms import RawTransform, parser_of, write_cdr, write_ros1
-from tfbus.recording.recording import MAX_DETAILS, open_storage
-from tfbus.tf_message import encode
+from tfbus.recording.recording import open_storage
+from tfbus.tf_message import MalformedMessageError, encode
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 TF = "tf2_msgs/msg/TFMessage"
@@ -33,6 +50,11 @@ LINES: list[Line] = [
     *((100 + k, "/tf", [moving("odom", "base", k, float(k)), moving("base", "wheel", k)]) for k in range(20)),
 ]
 EXPECTED = [(received, tuple(samples)) for received, _, samples in LINES]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
 
 
 def raw(path: Path) -> list[tuple[int, str, list[RawTransform]]]:
@@ -118,9 +140,11 @@ def test_a_bag_made_of_cdr_describes_its_types_as_ros_1_does(tmp_path: Path) -> 
     ]
 
 
-def test_other_topics_pass_through_untouched_or_are_converted_where_the_format_needs_it(tmp_path: Path) -> None:
+def test_other_topics_pass_through_untouched_or_are_converted_where_the_format_needs_it(
+    tmp_path: Path, path: Path
+) -> None:
     text = bytes(TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String"))
-    source = write_mcap(tmp_path / "run.mcap", [(5, "/said", text)], schema="std_msgs/msg/String")
+    source = write_mcap(path, [(5, "/said", text)], schema="std_msgs/msg/String")
     bag, back = tmp_path / "run.bag", tmp_path / "back.db3"
     convert([source], tmp_path / "same.mcap")
     assert lines_of_others(tmp_path / "same.mcap") == [("/said", 5, text)]
@@ -130,9 +154,9 @@ def test_other_topics_pass_through_untouched_or_are_converted_where_the_format_n
     assert lines_of_others(back) == [("/said", 5, text)]
 
 
-def test_what_a_format_cannot_hold_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_what_a_format_cannot_hold_is_left_out_and_counted(tmp_path: Path, path: Path) -> None:
     lines: list[Line] = [(1, "/a", b"{}"), (2, "/a", b"{}")]
-    source = write_mcap(tmp_path / "run.mcap", lines, schema="my.Thing", encoding="json")
+    source = write_mcap(path, lines, schema="my.Thing", encoding="json")
     for ending in (".bag", ".db3"):
         done = convert([source], tmp_path / f"run{ending}")
         assert (done.messages, done.problems) == (0, {"format": 2})
@@ -140,6 +164,10 @@ def test_what_a_format_cannot_hold_is_left_out_and_counted(tmp_path: Path) -> No
     unknown = write_mcap(tmp_path / "unknown.mcap", [(1, "/a", b"\0\1\0\0")], schema="my_msgs/msg/Thing")
     done = convert([unknown], tmp_path / "unknown.bag")
     assert (done.messages, done.problems) == (0, {"type": 1})
+    for schema, definition in (("Thing", b""), ("my_msgs/msg/Thing", b"\xff{{")):
+        write_mcap(unknown, [(1, "/a", b"\0\1\0\0")], schema=schema, definition=definition)
+        done = convert([unknown], tmp_path / "unknown.bag", overwrite=True)
+        assert (done.messages, done.problems) == (0, {"type": 1})
 
 
 def test_what_the_recorder_has_compressed_is_unfolded_and_what_only_looks_like_it_is_not(tmp_path: Path) -> None:
@@ -157,15 +185,6 @@ def test_what_the_recorder_has_compressed_is_unfolded_and_what_only_looks_like_i
     source = write_mcap(tmp_path / "other.mcap", lines, schema="my.Thing", encoding="protobuf")
     assert convert([source], path, overwrite=True).problems == {}
     assert [payload for _, _, payload in lines_of_others(path)] == [folded, torn, text]
-
-
-def test_details_are_kept_once_each_and_up_to_a_number() -> None:
-    done = Conversion()
-    for number in range(MAX_DETAILS + 1):
-        for _ in range(2):
-            done.note("type", f"number {number}")
-    assert done.problems == {"type": 2 * MAX_DETAILS + 2}
-    assert done.details == [f"number {number}" for number in range(MAX_DETAILS)]
 
 
 def test_runs_of_authorities_keep_their_lengths_and_a_single_one_stands_for_any_number(tmp_path: Path) -> None:
@@ -215,27 +234,12 @@ def test_only_some_frames_stay_with_their_authorities_and_empty_messages_go(tmp_
     assert (done.messages, done.transforms) == (20, 20)
 
 
-def test_a_single_authority_is_the_node_that_a_bag_names(tmp_path: Path, source: Path) -> None:
-    convert([source], tmp_path / "run.bag", edits=Edits(frames=["wheel"]))
-    with rosbag1.Reader(tmp_path / "run.bag") as bag:
-        assert {sender_of(connection) for connection in bag.connections} == {"/b"}
-    assert {each.authority for _, batch in batches_in(tmp_path / "run.bag") for each in batch} == {"b"}
-
-
-def test_a_message_without_transforms_stays_and_one_that_loses_all_of_them_goes(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "run.mcap", [(1, "/tf", []), (2, "/tf", [moving("a", "b", 2)])])
+def test_a_message_without_transforms_stays_and_one_that_loses_all_of_them_goes(tmp_path: Path, path: Path) -> None:
+    source = write_mcap(path, [(1, "/tf", []), (2, "/tf", [moving("a", "b", 2)])])
     told: list[int] = []
     done = convert([source], tmp_path / "some.mcap", edits=Edits(frames=["c"]), progress=told.append)
     assert batches_in(tmp_path / "some.mcap") == [(1, ())]
     assert (done.messages, done.transforms, told) == (1, 0, [1, 1])
-
-
-def test_of_the_metadata_of_a_channel_the_quality_of_service_stays(tmp_path: Path) -> None:
-    profiles = {"offered_qos_profiles": "- history: 1"}
-    source = write_mcap(tmp_path / "run.mcap", LINES, metadata={**profiles, "other": "x"})
-    edited(tmp_path, source, prefix="r/")
-    with (tmp_path / "edited.mcap").open("rb") as file:
-        assert [channel.metadata for _, channel, _ in make_reader(file).iter_messages()] == [profiles] * len(LINES)
 
 
 def test_static_transforms_are_left_out_and_told(tmp_path: Path, source: Path) -> None:
@@ -256,10 +260,10 @@ def test_a_part_begins_with_the_static_transforms_from_before(tmp_path: Path, so
 
 
 def test_static_transforms_from_before_a_part_come_once_each_in_the_order_in_which_they_came_last(
-    tmp_path: Path,
+    tmp_path: Path, path: Path
 ) -> None:
     sent = [(k, static("base", name, x)) for k, name, x in ((1, "a", 1.0), (2, "b", 1.0), (3, "a", 1.0), (4, "b", 2.0))]
-    source = write_mcap(tmp_path / "run.mcap", [(k, "/tf_static", [sample]) for k, sample in sent])
+    source = write_mcap(path, [(k, "/tf_static", [sample]) for k, sample in sent])
     b, a, other = sent[1][1], sent[2][1], sent[3][1]
     for since, expected in (
         (1, [(k, (sample,)) for k, sample in sent]),
@@ -306,12 +310,12 @@ def test_a_wrong_output_is_refused_and_nothing_is_left_behind(tmp_path: Path, so
     assert len(load(there).frames()) == 5
 
 
-def test_foxglove_transforms_become_those_of_ros(tmp_path: Path) -> None:
+def test_foxglove_transforms_become_those_of_ros(tmp_path: Path, path: Path) -> None:
     text = (
         b'{"transforms": [{"timestamp": {"sec": 1, "nsec": 2}, "parent_frame_id": "a", "child_frame_id": "b", '
         b'"translation": {"x": 1, "y": 2, "z": 0.1}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}]}'
     )
-    source = write_mcap(tmp_path / "run.mcap", [(5, "/tf", text)], schema="foxglove.FrameTransforms", encoding="json")
+    source = write_mcap(path, [(5, "/tf", text)], schema="foxglove.FrameTransforms", encoding="json")
     convert([source], tmp_path / "run.bag")
     ((received, topic, (found,)),) = raw(tmp_path / "run.bag")
     assert (received, topic, found[:4]) == (5, "/tf", (1, 2, b"a", b"b"))
@@ -321,8 +325,7 @@ def test_foxglove_transforms_become_those_of_ros(tmp_path: Path) -> None:
         assert [topic.type for topic in recording.topics] == ["foxglove.FrameTransforms"]
 
 
-def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: Path, path: Path) -> None:
     done = convert([SMALL], path, schema="foxglove")
     assert done.problems == {}
     assert raw(path) == raw(SMALL)
@@ -351,19 +354,16 @@ def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: P
     assert raw(tmp_path / "back.bag") == raw(SMALL)
 
 
-def test_foxglove_s_schema_is_for_mcap_and_keeps_authorities(tmp_path: Path, source: Path) -> None:
-    with pytest.raises(ValueError, match=r"must end in \.mcap"):
-        convert([source], tmp_path / "run.bag", schema="foxglove")
-    with pytest.raises(ValueError, match="'ros' or 'foxglove'"):
-        convert([source], tmp_path / "run.mcap", schema="json")  # type: ignore[arg-type]
-    convert([source], tmp_path / "run.mcap", schema="foxglove")
-    assert batches_in(tmp_path / "run.mcap") == batches_in(source)
-
-
-def test_new_names_are_checked() -> None:
+def test_wrong_edits_and_schemas_are_refused(tmp_path: Path, path: Path, source: Path) -> None:
     for arguments in ({"rename": {"a": "/b"}}, {"rename": {"a": ""}}, {"prefix": "/r"}):
         with pytest.raises(ValueError, match="a frame name"):
             Edits(**arguments)
+    with pytest.raises(ValueError, match=r"must end in \.mcap"):
+        convert([source], tmp_path / "run.bag", schema="foxglove")
+    with pytest.raises(ValueError, match="'ros' or 'foxglove'"):
+        convert([source], path, schema="json")  # type: ignore[arg-type]
+    convert([source], path, schema="foxglove")
+    assert batches_in(path) == batches_in(source)
 
 
 @pytest.mark.parametrize("ending", ["mcap", "bag", "db3"])
@@ -396,3 +396,151 @@ def test_a_link_that_somebody_has_made_beside_the_output_leads_nowhere(tmp_path:
     assert precious.read_bytes() == b"precious"
     assert not output.is_symlink()
     assert sorted(tmp_path.iterdir()) == sorted([*before, output])
+
+
+SLASHED = RawTransform(1, 2, b"/odom", b"/base", bytes(56))
+
+
+def test_names_are_compared_without_their_slashes() -> None:
+    assert Edits(rename={"base": "body"}).apply(SLASHED)[2:4] == (b"/odom", b"body")
+    assert Edits(prefix="r/").apply(SLASHED)[2:4] == (b"r/odom", b"r/base")
+    assert Edits(frames=["base"]).keeps(SLASHED)
+    assert not Edits(frames=["odom"]).keeps(SLASHED)
+
+
+def test_a_name_that_is_no_text_keeps_its_bytes() -> None:
+    broken = RawTransform(1, 2, b"/odom", b"\xffbase", bytes(56))
+    assert Edits(prefix="r/").apply(broken).child == b"r/\xffbase"
+
+
+TF_CHANNEL = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr")
+PAYLOAD = encode([moving("a", "b", 5)])
+
+
+def test_a_copy_in_mcap_is_a_recording_of_ros_2(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    copy = McapCopy(path, "run")
+    copy.write(Channel("/log", "", "json"), 5, b"{}")
+    copy.write(TF_CHANNEL, 6, PAYLOAD)
+    copy.finish()
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        assert [(entry.name, entry.metadata) for entry in reader.iter_metadata()] == [("rosbag2", {})]
+        assert (reader.get_header().profile, reader.get_header().library) == ("ros2", "tfbus")
+        # A message without a type has no schema.
+        found = [
+            (schema and schema.name, channel.topic, each.log_time, each.publish_time, each.data)
+            for schema, channel, each in reader.iter_messages()
+        ]
+    assert found == [(None, "/log", 5, 5, b"{}"), ("tf2_msgs/msg/TFMessage", "/tf", 6, 6, PAYLOAD)]
+
+
+def test_times_before_1970_are_refused_where_a_format_has_none(tmp_path: Path) -> None:
+    for kind in (McapCopy, BagCopy):
+        copy = kind(tmp_path / "run", "run")
+        with pytest.raises(CannotWriteError, match="no time before 1970"):
+            copy.write(TF_CHANNEL, -1, PAYLOAD)
+        # 1970 begins with 0.
+        copy.write(TF_CHANNEL, 0, PAYLOAD)
+        copy.close()
+
+
+def test_without_the_extra_a_copy_in_foxglove_s_schema_makes_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove.messages", None)
+    with pytest.raises(ImportError):
+        FoxgloveCopy(tmp_path / "run", "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_definition_of_a_type_stays_where_it_is_one_of_ros_2(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    copy = SqliteCopy(path, "run.db3")
+    for kind, encoding in (("a/msg/A", "ros2msg"), ("b/msg/B", "ros2idl"), ("c/msg/C", "")):
+        copy.write(Channel(f"/{kind}", kind, "cdr", encoding, b"int8 x"), 1, b"")
+    copy.write(Channel("/tf", TF_CHANNEL.type, "cdr", "ros2msg", b"int8 y"), 1, b"")
+    copy.finish()
+    with closing(sqlite3.connect(path)) as file:
+        found = file.execute("SELECT * FROM message_definitions ORDER BY id").fetchall()
+    assert found == [(1, "a/msg/A", "ros2msg", "int8 x", ""), (2, TF_CHANNEL.type, "ros2msg", "int8 y", TYPE_HASH)]
+
+
+def test_a_bag_is_latching_where_transforms_are_static(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    copy = BagCopy(path, "run.bag")
+    for topic in ("/tf", "/tf_static"):
+        copy.write(Channel(topic, TF_CHANNEL.type, "cdr"), 1, PAYLOAD)
+    copy.finish()
+    with Reader(path) as bag:
+        # As a publisher of ROS 1 says it: not at all, or 1.
+        found = {each.topic: getattr(each.ext, "latching", "") for each in bag.connections}
+    assert found == {"/tf": None, "/tf_static": 1}
+
+
+@pytest.mark.parametrize(
+    ("times", "start", "duration"), [([], 0, 0), ([0], 0, 0), ([7, 5, 9], 5, 4), ([-9, -5, -7], -9, 4)]
+)
+def test_the_metadata_have_the_first_time_and_the_duration(
+    tmp_path: Path, times: list[int], start: int, duration: int
+) -> None:
+    path = tmp_path / "run.db3"
+    copy = SqliteCopy(path, "run.db3")
+    for time in times:
+        copy.write(TF_CHANNEL, time, PAYLOAD)
+    copy.finish()
+    with closing(sqlite3.connect(path)) as file:
+        ((text,),) = file.execute("SELECT metadata FROM metadata")
+    metadata = json.loads(text)["rosbag2_bagfile_information"]
+    (of_file,) = metadata["files"]
+    for each in (metadata, of_file):
+        assert each["starting_time"] == {"nanoseconds_since_epoch": start}
+        assert each["duration"] == {"nanoseconds": duration}
+        assert each["message_count"] == len(times)
+    assert [topic["message_count"] for topic in metadata["topics_with_message_count"]] == [len(times)] * bool(times)
+
+
+def test_a_type_that_the_file_defines_is_converted() -> None:
+    cdr = Channel("/a", "my_msgs/msg/Pair", "cdr", "ros2msg", b"uint8 a\nuint32 b\n")
+    ros1 = Channel("/a", "my_msgs/Pair", "ros1", "ros1msg", b"uint8 a\nuint32 b\n")
+    payload = b"\0\1\0\0\7\0\0\0\5\0\0\0"
+    assert MessageTypes().convert(cdr, payload) == b"\7\5\0\0\0"
+    assert MessageTypes().convert(ros1, b"\7\5\0\0\0") == payload
+    definition, digest = MessageTypes().ros1_definition(cdr)
+    assert "uint32 b" in definition
+    assert len(digest) == 32
+
+
+@pytest.mark.parametrize(
+    ("kind", "digest"),
+    [
+        ("std_msgs/msg/String", "992ce8a1687cec8c8bd883ec73ca41d1"),
+        ("std_msgs/msg/Header", "2176decaecbce78abc3b96ef049fabed"),
+        ("geometry_msgs/msg/PointStamped", "c63aecb41bfdfd6b7e1fac37c7cbe7bf"),
+        ("nav_msgs/msg/Odometry", "cd5e73d190d741a2f92e81eda573aca7"),
+        ("tf2_msgs/msg/TFMessage", "94810edda583a504dfda3829e70d7eec"),
+    ],
+)
+def test_the_definition_of_a_type_of_ros_2_has_the_digest_of_ros_1(kind: str, digest: str) -> None:
+    definition, found = MessageTypes().ros1_definition(Channel("/a", kind, "cdr"))
+    assert found == digest
+    # A header counts the messages there, which ROS 2 has given up.
+    assert ("uint32 seq\ntime stamp\nstring frame_id\n" in definition) == (kind != "std_msgs/msg/String")
+
+
+CHANNEL = foxglove_channel(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"), {})
+
+numbers = st.lists(st.floats(), min_size=7, max_size=7).map(lambda values: struct.pack("<7d", *values))
+
+
+def test_the_seconds_that_a_stamp_of_foxglove_holds_are_written() -> None:
+    for seconds in (-(2**63), -1, 2**63 - 1):
+        edge = RawTransform(seconds, 0, b"map", b"base", bytes(56))
+        assert parser_of(CHANNEL)(write_protobuf([edge])) == [edge]
+    # A negative number has ten bytes, as one of 64 bits in two's complement.
+    before = RawTransform(-1, 0, b"map", b"base", bytes(56))
+    assert b"\x08" + b"\xff" * 9 + b"\x01\x10" in write_protobuf([before])
+    for seconds in (-(2**63) - 1, 2**63):
+        with pytest.raises(MalformedMessageError, match=f"{seconds} s does not fit the stamp") as raised:
+            write_protobuf([RawTransform(seconds, 0, b"map", b"base", bytes(56))])
+        assert raised.value.reason == "stamp"

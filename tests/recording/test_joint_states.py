@@ -20,6 +20,11 @@ ARM = RobotModel(
 )
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
 def write(path: Path, *payloads: bytes, topic: str = "/joint_states", schema: str = KIND) -> Path:
     return write_mcap(path, [(at, topic, payload) for at, payload in enumerate(payloads)], schema=schema)
 
@@ -49,8 +54,7 @@ def test_what_cannot_be_used_is_counted_and_the_rest_is_read(tmp_path: Path) -> 
     assert tree.inserted == 3
 
 
-def test_a_part_includes_both_ends_and_damage_is_counted(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_a_part_includes_both_ends_and_damage_is_counted(path: Path) -> None:
     payloads = [joint_state(k, {"shoulder": 0.1 * k, "tail": 1.0, "ear": 1.0}) for k in range(5)]
     write_mcap(path, [(k, "/joint_states", each) for k, each in enumerate(payloads)], schema=KIND, chunk_size=1)
     data = bytearray(path.read_bytes())

@@ -1,4 +1,5 @@
-import logging
+"""A recording becomes a tree, with the answers of tf2."""
+
 import math
 from collections import Counter
 from contextlib import closing
@@ -8,18 +9,17 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin
-from support.recorded import SMALL, WRONG_IN_SMALL, answers, as_ros2, messages_in, real, write_mcap
+from support.recorded import SMALL, WRONG_IN_SMALL, Line, answers, as_ros2, write_mcap
 from support.samples import any_samples, moving, over, static, x_of
 
 from tfbus import (
     LATEST,
+    SECOND,
     Buffer,
     Bus,
     DisconnectedError,
     ExtrapolationError,
-    RecordingError,
     Transform,
     TransformLookupError,
     TransformStamped,
@@ -28,11 +28,9 @@ from tfbus import (
 )
 from tfbus.recording import load, open_recording
 from tfbus.recording.formats.mcap_output import McapOutput
-from tfbus.recording.recording import MAX_DETAILS, Problems, fill
+from tfbus.recording.recording import MAX_DETAILS, Problems, SpeedLimit, fill
 from tfbus.tf_message import MalformedMessageError
-from tfbus.tree.tree import forest_of
 
-SECOND = 1_000_000_000
 TOLERANCE = 1e-9
 
 ERRORS: dict[str, type[TransformLookupError]] = {
@@ -40,6 +38,11 @@ ERRORS: dict[str, type[TransformLookupError]] = {
     "ConnectivityException": DisconnectedError,
     "ExtrapolationException": ExtrapolationError,
 }
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
 
 
 def disagreement(tree: TransformTree, answer: dict[str, Any]) -> str:
@@ -86,39 +89,6 @@ def test_a_loaded_recording_gives_the_answers_of_tf2_in_every_format(tmp_path: P
     assert problems == WRONG_IN_SMALL
 
 
-@pytest.mark.thorough
-def test_the_kth_transform_of_a_turtle_is_its_kth_pose() -> None:
-    path = real("turtlesim.bag")
-    tree = load(path)
-    sent: dict[str, list[int]] = {"turtle1": [], "turtle2": []}
-    for message in messages_in(path):
-        for sample in message.batch:
-            if sample.child in sent:
-                sent[sample.child].append(sample.stamp)
-    with AnyReader([path]) as reader:
-        for turtle, stamps in sent.items():
-            topic = [connection for connection in reader.connections if connection.topic == f"/{turtle}/pose"]
-            poses: list[Any] = [reader.deserialize(raw, link.msgtype) for link, _, raw in reader.messages(topic)]
-            assert len(poses) == len(stamps) == 1344
-            assert sorted(set(stamps)) == stamps
-            for pose, stamp in zip(poses, stamps, strict=True):
-                found = tree.lookup("world", turtle, stamp).transform
-                assert found.translation == (pose.x, pose.y, 0.0)
-                half = pose.theta / 2
-                assert found.rotation == pytest.approx((0.0, 0.0, math.sin(half), math.cos(half)), abs=2e-16)
-    assert tree.lookup("turtle1", "carrot").static
-
-
-def test_the_pr2_has_all_its_frames() -> None:
-    problems: Counter[str] = Counter()
-    tree = load(real("pr2_tf.bag"), problems=problems)
-    edges = tree.edges()
-    assert len(edges) == 82
-    assert problems == {}
-    assert {edge.authority for edge in edges} == {"robot_state_publisher"}
-    tree.lookup("base_footprint", "l_gripper_tool_frame")
-
-
 def test_samples_are_kept_however_old_they_are(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", over("a", "b", (0, 1_000_000 * SECOND), speed=1e-9))])
     tree = load(path)
@@ -126,48 +96,37 @@ def test_samples_are_kept_however_old_they_are(tmp_path: Path) -> None:
     assert x_of(tree, "a", "b", 250_000 * SECOND) == pytest.approx(250_000.0)
 
 
-def test_an_authority_that_joins_another_in_a_long_recording_is_loaded_too(tmp_path: Path) -> None:
-    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
+def test_an_authority_that_joins_another_in_a_long_recording_is_loaded_too(path: Path) -> None:
+    with closing(McapOutput(str(path), overwrite=True)) as output:
         senders = [1 if k > 1_000 and k % 2 else 0 for k in range(1_200)]
         output.write([(k, (moving("a", "b", k, float(k), f"sender {one}"),)) for k, one in enumerate(senders)])
         output.finish()
-    tree = load(tmp_path / "run.mcap")
+    tree = load(path)
     (edge,) = tree.edges()
     assert edge.samples == 1_200
     assert [x_of(tree, "a", "b", k) for k in (999, 1_100, 1_101)] == [999.0, 1_100.0, 1_101.0]
 
 
-def test_a_range_has_its_own_samples_and_the_static_ones_from_before(tmp_path: Path) -> None:
+def test_a_range_has_its_own_samples_and_the_static_ones_from_before(path: Path) -> None:
     lines = [
         (0, "/tf_static", [static("b", "fixed", 5.0)]),
         *((time, "/tf", [moving("a", "b", time + 1_000, float(time))]) for time in range(10, 60, 10)),
     ]
-    tree = load(write_mcap(tmp_path / "run.mcap", lines), 20, 40)
+    tree = load(write_mcap(path, lines), 20, 40)
     (edge, fixed) = tree.edges()
     assert (edge.child, edge.samples, edge.oldest, edge.newest) == ("b", 3, 1_020, 1_040)
     assert fixed.static
     assert x_of(tree, "a", "fixed", 1_030) == 35.0
 
 
-def test_a_loop_of_parents_is_left_out_and_the_rest_of_its_message_is_not(tmp_path: Path) -> None:
+def test_a_loop_of_parents_is_left_out_and_the_rest_of_its_message_is_not(path: Path) -> None:
     lines = [(1, "/tf", [moving("a", "b", 1)]), (2, "/tf", [moving("b", "a", 2), moving("a", "c", 2, 7.0)])]
     problems: Counter[str] = Counter()
-    tree = load(write_mcap(tmp_path / "run.mcap", lines), problems=problems)
+    tree = load(write_mcap(path, lines), problems=problems)
     assert problems == {"cycle": 1}
     assert tree.chain("c", "b") == ["c", "a", "b"]
     assert tree.frames() == ["a", "b", "c"]
     assert x_of(tree, "a", "c") == 7.0
-
-
-def test_one_message_may_reverse_an_edge(tmp_path: Path) -> None:
-    lines = [
-        (1, "/tf", [moving("map", "a", 1), moving("a", "b", 1)]),
-        (2, "/tf", [moving("b", "a", 2), moving("map", "b", 2)]),
-    ]
-    problems: Counter[str] = Counter()
-    tree = load(write_mcap(tmp_path / "run.mcap", lines), problems=problems)
-    assert problems == {}
-    assert tree.chain("map", "a") == ["map", "b", "a"]
 
 
 @given(batches=st.lists(st.lists(any_samples("abcd", last=20), min_size=1, max_size=4), max_size=15))
@@ -188,14 +147,15 @@ def test_the_tree_has_the_samples_that_a_bus_would_accept(
     assert tree.to_yaml() == buffer.tree.to_yaml()
 
 
-def test_without_a_counter_the_problems_are_logged_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING, "tfbus"):
-        load(SMALL)
+def test_without_a_counter_the_problems_are_logged_in_one_line(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    load(SMALL)
     (record,) = caplog.records
     assert record.getMessage().startswith(f"left out of {SMALL}: 3 x not finite, 2 x frame name, ")
     caplog.clear()
-    load(SMALL, problems=Counter())
-    assert caplog.records == []
+    problems = Counter({"cycle": 10})
+    load(SMALL, problems=problems)
+    load(write_mcap(path, [(1, "/tf", [moving("a", "b", 1)])]))
+    assert (problems["cycle"], caplog.records) == (11, [])
 
 
 def test_what_is_not_read_although_it_may_hold_transforms_is_logged(
@@ -206,17 +166,6 @@ def test_what_is_not_read_although_it_may_hold_transforms_is_logged(
     assert [record.getMessage() for record in caplog.records] == [
         f"{path}: not read: 1 messages on topic /{name}/tf of type tf2_msgs/msg/TFMessage" for name in ("r1", "r2")
     ]
-
-
-def test_nothing_is_logged_for_a_good_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    load(write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("a", "b", 1)])]))
-    assert caplog.records == []
-
-
-def test_problems_are_added_to_a_given_counter() -> None:
-    problems = Counter({"cycle": 10})
-    load(SMALL, problems=problems)
-    assert problems["cycle"] == 11
 
 
 def test_the_progress_of_filling_a_tree_is_told_in_messages_read() -> None:
@@ -236,20 +185,11 @@ def test_the_details_of_damaged_messages_are_kept_up_to_a_number() -> None:
     assert problems.details == [f"number {number}" for number in range(MAX_DETAILS)]
 
 
-def test_a_missing_recording_raises(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError):
-        load(tmp_path / "run.mcap")
-
-
-def test_a_lookup_in_a_loaded_tree_is_not_stale_after_the_shape_has_changed(tmp_path: Path) -> None:
-    lines = [(time, "/tf", [moving("a" if time < 5 else "z", "b", time, float(time))]) for time in range(10)]
-    tree = load(
-        write_mcap(tmp_path / "run.mcap", [(0, "/tf_static", [static("root", "a"), static("root", "z")]), *lines])
-    )
-    assert tree.parent("b", 3) == "a"
-    assert tree.parent("b", 7) == "z"
-    forest = forest_of(tree)
-    assert (forest.changed, forest.new_parents) == (set(), set())
+def test_a_frame_has_the_parent_of_each_time(path: Path) -> None:
+    lines: list[Line] = [(time, "/tf", [moving("a" if time < 5 else "z", "b", time)]) for time in range(10)]
+    lines.insert(0, (0, "/tf_static", [static("root", "a"), static("root", "z")]))
+    tree = load(write_mcap(path, lines))
+    assert (tree.parent("b", 3), tree.parent("b", 7)) == ("a", "z")
 
 
 def test_a_translation_that_is_not_physical_is_left_out_unless_the_bound_is_raised(tmp_path: Path) -> None:
@@ -265,60 +205,101 @@ def test_a_translation_that_is_not_physical_is_left_out_unless_the_bound_is_rais
         load(path, max_translation=0.0)
 
 
-def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(tmp_path: Path) -> None:
+def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(path: Path) -> None:
     lines = [(10 * k, moving("a", "b", 10 * k, float(k))) for k in range(2_000)]
     # The same instant again: the sample that comes later counts.
     lines.insert(1_500, (14_990, moving("a", "b", 14_990, -1.0)))
     # Beyond the bound, each along another axis, and each in another block.
     for place, far in ((1_950, (1e13, 0.0, 0.0)), (1_600, (0.0, 1e13, 0.0)), (1_300, (0.0, 0.0, 1e13))):
         lines.insert(place, (10 * place - 10, TransformStamped("a", "b", 10 * place - 5, Transform(far))))
-    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
+    with closing(McapOutput(str(path), overwrite=True)) as output:
         output.write([(received, (sample,)) for received, sample in lines])
         output.finish()
     problems: Counter[str] = Counter()
-    tree = load(tmp_path / "run.mcap", problems=problems)
+    tree = load(path, problems=problems)
     assert problems == {"not physical": 3}
     (edge,) = tree.edges()
     assert (edge.samples, edge.oldest, edge.newest) == (2_000, 0, 19_990)
     asked = [0, 5, 9_990, 14_980, 14_990, 15_000, 17_995, 19_990]
     expected = [0.0, 0.5, 999.0, 1_498.0, -1.0, 1_500.0, 1_799.5, 1_999.0]
     assert [x_of(tree, "a", "b", stamp) for stamp in asked] == expected
+    assert (tree.inserted, tree.replaced, tree.expired) == (2_000, 1, 0)
+    tree.insert(moving("a", "b", 20_000, 2_000.0))
+    assert x_of(tree, "a", "b", 19_995) == 1_999.5
 
 
-@pytest.mark.parametrize("axis", [None, 0, 1, 2])
-def test_samples_that_change_no_edge_are_stored_at_once_unless_one_is_beyond_the_bound(
-    tmp_path: Path, axis: int | None
-) -> None:
-    # The blocks of so many messages are several, and the first one names the frame.
-    lines = [(k, moving("a", "b", 10 * k, float(k), "slam")) for k in range(8_192 + 300)]
-    if axis is not None:
-        far = [0.0, 0.0, 0.0]
-        far[axis] = -1e5
-        lines.insert(8_400, (8_400, TransformStamped("a", "b", 83_995, Transform(far), "slam")))
-    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
-        output.write([(received, (sample,)) for received, sample in lines])
-        output.finish()
+def kept(*places: float, speed: float = 2.0) -> tuple[list[float], Counter[str]]:
+    """The indices of those of some places, one a second, that stay."""
+    limit = SpeedLimit(speed)
+    found: list[TransformStamped] = []
+    for at, x in enumerate(places):
+        found += limit.admit((moving("a", "b", at * SECOND, x),))
+    found += limit.undecided()
+    # Each of them once.
+    assert limit.undecided() == ()
+    return [sample.transform.translation[0] for sample in found], limit.dropped
+
+
+@pytest.mark.parametrize(
+    ("places", "stay"),
+    [
+        ([0, 1, 100, 3, 5], [0, 1, 3, 5]),
+        ([0, 2, 4], [0, 2, 4]),
+        # The first sample goes if the next ones contradict it.
+        ([1e9, 0, 1, 2], [0, 1, 2]),
+        ([0, 1e9, 1, 2], [0, 1, 2]),
+        ([7], [7]),
+        ([0, 1e9], [0]),
+        ([0, 1e9, -1e9, 5e9], [0]),
+        # A frame that really is elsewhere is reached in time.
+        ([0, 0, 5, 5, 5], [0, 0, 5]),
+    ],
+)
+def test_a_sample_that_is_too_far_from_the_others_is_dropped(places: list[float], stay: list[float]) -> None:
+    gone = len(places) - len(stay)
+    assert kept(*places) == (stay, {"speed": gone} if gone else {})
+
+
+MOST = 16
+
+
+def test_candidates_are_bounded() -> None:
+    places = [1e3 * 4**k for k in range(40)]
+    found, dropped = kept(*places)
+    assert (len(found), dropped) == (1, {"speed": 39})
+    # The oldest one is forgotten, so what comes back to its place confirms nothing.
+    found, dropped = kept(*places, places[0])
+    assert (len(found), dropped) == (1, {"speed": 40})
+    # As long as it is remembered, it is confirmed, and the others go; of one more, two are forgotten in turn.
+    most = places[:MOST]
+    assert kept(*most, places[0]) == ([places[0], places[0]], {"speed": MOST - 1})
+    most = places[: MOST + 1]
+    assert kept(*most, places[0]) == ([places[2]], {"speed": MOST + 1})
+
+
+def test_frames_parents_and_kinds_are_apart() -> None:
+    limit = SpeedLimit(1.0)
+    first = (moving("a", "b", 0), moving("a", "c", 0, 50.0), static("b", "d", 9e9))
+    assert limit.admit(first) == (first[2],)
+    second = (moving("a", "b", SECOND, 1.0), moving("z", "b", SECOND, 900.0), moving("a", "c", SECOND, 51.0))
+    assert limit.admit(second) == (first[0], second[0], first[1], second[2])
+    # Of one stamp, the last one wins: no speed is known.
+    third = (moving("a", "b", SECOND, 80.0),)
+    assert limit.admit(third) == third
+
+
+@pytest.mark.parametrize(("speed", "error"), [(0.0, ValueError), (-1.0, ValueError), ("fast", TypeError)])
+def test_a_speed_is_a_number_greater_than_zero(speed: Any, error: type[Exception]) -> None:
+    with pytest.raises(error, match="max_speed"):
+        SpeedLimit(speed)
+
+
+def test_load_leaves_out_what_nothing_can_have_reached(tmp_path: Path) -> None:
+    # So many would be stored at once.
+    places = [5e9, *range(1_000), 7e7, *range(1_000, 2_000)]
+    lines = [(at, "/tf", [moving("map", "base", at * SECOND, float(x))]) for at, x in enumerate(places)]
+    path = write_mcap(tmp_path / "run.mcap", [*lines, (9_000, "/tf", [moving("map", "lone", 0, 5.0)])])
     problems: Counter[str] = Counter()
-    tree = load(tmp_path / "run.mcap", problems=problems, max_translation=9e3)
-    assert problems == ({} if axis is None else {"not physical": 1})
-    (edge,) = tree.edges()
-    assert (edge.samples, edge.oldest, edge.newest, edge.authority) == (8_492, 0, 84_910, "slam")
-    assert [x_of(tree, "a", "b", stamp) for stamp in (81_915, 83_990, 84_000, 84_910)] == [
-        8_191.5,
-        8_399.0,
-        8_400.0,
-        8_491.0,
-    ]
-    tree.insert(moving("a", "b", 84_920, 8_492.0))
-    assert x_of(tree, "a", "b", 84_915) == 8_491.5
-
-
-def test_each_sample_of_a_block_is_inserted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Each message has a block of its own, and the first one names the frames.
-    monkeypatch.setattr("tfbus.recording.formats.mcap._FIRST_BLOCK", 1)
-    stamps = [1, 2, 3, 4, 4, 5]
-    lines = [(at, "/tf", [moving("a", "b", stamp), moving("b", "c", stamp)]) for at, stamp in enumerate(stamps)]
-    tree = load(write_mcap(tmp_path / "run.mcap", lines, chunk_size=1))
-    # One stamp comes twice.
-    assert (tree.inserted, tree.replaced, tree.expired) == (2 * 5, 2, 0)
-    assert [(edge.child, edge.samples) for edge in tree.edges()] == [("b", 5), ("c", 5)]
+    tree = load(path, max_speed=3.0, problems=problems)
+    assert {edge.child: edge.samples for edge in tree.edges()} == {"base": 2_000, "lone": 1}
+    assert problems == {"speed": 2}

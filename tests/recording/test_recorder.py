@@ -1,22 +1,23 @@
+"""A bus is recorded: in order, within bounds, and whole whatever happens."""
+
 import asyncio
-import errno
-import json
 import os
 import random
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Awaitable, Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import closing
 from io import BytesIO
+from itertools import count
 from pathlib import Path
 
 import anyio
 import anyio.from_thread
 import anyio.to_thread
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from support.asking import Asked, settle
@@ -24,7 +25,6 @@ from support.samples import any_samples, moving, static
 
 from tfbus import (
     SECOND,
-    Buffer,
     Bus,
     BusClosedError,
     Event,
@@ -34,15 +34,10 @@ from tfbus import (
     RecordingFailed,
     SimulatedClock,
     Transform,
-    TransformBroadcaster,
-    TransformError,
     TransformStamped,
-    TransformTree,
 )
-from tfbus.bus.queues import TimedBatch
-from tfbus.recording.formats.mcap_output import McapOutput
-from tfbus.recording.recorder import _SLICE, Recorder
-from tfbus.recording.recording import load, open_recording
+from tfbus.recording.recorder import Recorder, WriteQueue
+from tfbus.recording.recording import open_recording
 
 pytestmark = pytest.mark.anyio
 
@@ -50,6 +45,17 @@ Run = Callable[[Callable[[], Awaitable[None]]], None]
 
 PATIENCE = 60.0
 """Real seconds after which a test that hangs is given up."""
+
+
+@pytest.fixture
+def bus() -> Iterator[Bus]:
+    with Bus(SimulatedClock()) as bus:
+        yield bus
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
 
 
 def recorded(path: Path) -> list[tuple[int, tuple[TransformStamped, ...]]]:
@@ -122,8 +128,7 @@ def pipe(tmp_path: Path) -> Iterator[Pipe]:
         yield pipe
 
 
-async def test_latched_samples_come_before_published_ones(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+async def test_latched_samples_come_before_published_ones(path: Path) -> None:
     clock = SimulatedClock(7 * SECOND)
     with Bus(clock) as bus:
         bus.publish(
@@ -144,262 +149,84 @@ async def test_latched_samples_come_before_published_ones(tmp_path: Path) -> Non
     ]
 
 
-async def test_a_batch_is_recorded_under_the_simulated_time_of_its_publication(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    clock = SimulatedClock()
-    with Bus(clock) as bus:
-        broadcaster = TransformBroadcaster(bus, authority="odometry")
-
-        async def drive() -> None:
-            async for tick in clock.ticks(100.0):
-                broadcaster.send("map", "base", Transform((tick / 100, 0.0, 0.0)), at=7)
-
-        async with Recorder(bus, path), anyio.create_task_group() as tasks:
-            tasks.start_soon(drive)
-            await clock.advance(2.0)
-            tasks.cancel_scope.cancel()
-    assert [received for received, _ in recorded(path)] == [tick * SECOND // 100 for tick in range(201)]
-
-
-def answers(tree: TransformTree, stamps: range) -> list[str]:
-    """Everything that can be asked of a tree, to the last bit; where there is no answer, why."""
-    found = []
-    for target in sorted(tree.frames()):
-        for source in sorted(tree.frames()):
-            for stamp in stamps:
-                try:
-                    found.append(repr(tree.lookup(target, source, stamp)))
-                except TransformError as error:
-                    found.append(f"{target} {source} {stamp}: {error}")
-    return found
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(st.lists(any_samples("abcd", 5), min_size=1, max_size=4), max_size=12))
-@pytest.mark.thorough
-def test_a_loaded_recording_gives_the_answers_that_the_buffer_gave(
-    run: Run, tmp_path: Path, batches: list[list[TransformStamped]]
-) -> None:
-    path = tmp_path / "run.mcap"
-
-    async def record() -> None:
-        with Bus(SimulatedClock()) as bus:
-            buffer = Buffer(bus, keep=None)
-            async with Recorder(bus, path, overwrite=True):
-                for batch in batches:
-                    # One by one, for a batch of both kinds is divided in the file, and then less can be judged at once.
-                    for sample in batch:
-                        bus.publish(sample, invalid="drop")
-            before.extend(answers(buffer.tree, range(7)))
-
-    before: list[str] = []
-    run(record)
-    assert answers(load(path), range(7)) == before
-
-
-async def test_two_recorders_of_one_bus_write_the_same(tmp_path: Path) -> None:
-    one, two = tmp_path / "one.mcap", tmp_path / "two.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, one), Recorder(bus, str(two)):
-            for sample in noise(3_000):
-                bus.publish(sample)
-    assert one.read_bytes() == two.read_bytes()
-    assert len(recorded(one)) == 3_000
-
-
-async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, path) as recorder:
-            for number in range(1, 4):
-                bus.publish(moving("map", "a", number))
-                await recorder.flush()
-                assert (recorder.statistics().samples, recorder.statistics().queue.pending) == (number, 0)
-                with open_recording(path) as recording:
-                    *messages, unfinished = recording.messages()
-                    assert len(messages) == number
-                    assert [error.reason for error in unfinished.errors] == ["unfinished"]
-                    assert not recording.finished
-        await recorder.flush()
-
-
-async def test_a_flush_writes_all_that_is_pending_in_whatever_parts(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, path) as recorder:
-            # So many are written at once, and a quarter of them more.
-            for number in range(5_120):
-                bus.publish(moving("map", "a", number))
+async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path) as recorder:
+        for number in range(1, 4):
+            bus.publish(moving("map", "a", number))
             await recorder.flush()
-            assert recorder.statistics().queue.pending == 0
+            assert (recorder.statistics().samples, recorder.statistics().queue.pending) == (number, 0)
             with open_recording(path) as recording:
-                # And the report that the file is not finished.
-                assert sum(map(len, recording.blocks())) == 5_120 + 1
+                *messages, unfinished = recording.messages()
+                assert len(messages) == number
+                assert [error.reason for error in unfinished.errors] == ["unfinished"]
+                assert not recording.finished
+    await recorder.flush()
 
 
-@pytest.fixture
-def writes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, bool]]:
-    """The number of batches of each write, and whether it ends the chunk."""
-    found: list[tuple[int, bool]] = []
-    write = McapOutput.write
-
-    def note(output: McapOutput, batches: Iterable[TimedBatch], flush: bool = False) -> None:
-        several = list(batches)
-        write(output, several, flush)
-        found.append((len(several), flush))
-
-    monkeypatch.setattr(McapOutput, "write", note)
-    return found
+async def test_a_flush_writes_all_that_is_pending_in_whatever_parts(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path) as recorder:
+        # So many are written at once, and a quarter of them more.
+        for number in range(5_120):
+            bus.publish(moving("map", "a", number))
+        await recorder.flush()
+        assert recorder.statistics().queue.pending == 0
+        with open_recording(path) as recording:
+            # And the report that the file is not finished.
+            assert sum(map(len, recording.blocks())) == 5_120 + 1
 
 
-async def test_a_flush_ends_a_chunk_once_behind_all_that_is_pending(
-    tmp_path: Path, writes: list[tuple[int, bool]]
-) -> None:
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
-            for number in range(_SLICE + 1):
-                bus.publish(moving("map", "a", number))
+async def test_a_flush_does_not_wait_for_what_comes_meanwhile(path: Path) -> None:
+    published: list[int] = []
+
+    async def publish_without_end(bus: Bus) -> None:
+        for number in count():
+            bus.publish(moving("map", "a", number))
+            published.append(number)
+            await anyio.lowlevel.checkpoint()
+
+    with Bus(SimulatedClock()) as bus, anyio.fail_after(PATIENCE):
+        async with Recorder(bus, path) as recorder, anyio.create_task_group() as tasks:
+            tasks.start_soon(publish_without_end, bus)
+            while len(published) < 100:
+                await anyio.lowlevel.checkpoint()
+            before = len(published)
             await recorder.flush()
-            assert writes == [(_SLICE, False), (1, True)]
+            tasks.cancel_scope.cancel()
+            assert recorder.statistics().samples >= before
 
 
-async def test_a_flush_does_not_wait_for_what_comes_meanwhile(
-    tmp_path: Path, writes: list[tuple[int, bool]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write = McapOutput.write
-    more = iter(range(1, 100))
-
-    def publish_and_write(output: McapOutput, batches: Iterable[TimedBatch], flush: bool = False) -> None:
-        if (stamp := next(more, None)) is not None:
-            anyio.from_thread.run_sync(bus.publish, moving("map", "a", stamp))
-        write(output, batches, flush)
-
-    monkeypatch.setattr(McapOutput, "write", publish_and_write)
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
-            bus.publish(moving("map", "a", 0))
-            await recorder.flush()
-            assert writes == [(1, True)]
-            assert recorder.statistics().queue.pending == 1
-
-
-@pytest.mark.parametrize(("period", "flushed"), [(3_600.0, [True, False, False]), (0.0, [True] * 3)])
-async def test_a_chunk_ends_by_itself_when_a_period_is_over(
-    tmp_path: Path,
-    writes: list[tuple[int, bool]],
-    monkeypatch: pytest.MonkeyPatch,
-    period: float,
-    flushed: list[bool],
-) -> None:
-    monkeypatch.setattr("tfbus.recording.recorder._WRITE_PERIOD", 0.0)
-    monkeypatch.setattr("tfbus.recording.recorder._FLUSH_PERIOD", period)
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
-            for number in range(1, 4):
-                bus.publish(moving("map", "a", number))
-                await until(lambda number=number: len(writes) == number)  # type: ignore[misc]
-                statistics = recorder.statistics()
-                assert (statistics.samples, statistics.queue.pending) == (
-                    (number, 0) if period == 0.0 else (1, number - 1)
-                )
-            assert writes == [(1, flush) for flush in flushed]
-
-
-async def test_the_last_samples_of_a_burst_are_written_when_a_period_is_over(
-    tmp_path: Path, writes: list[tuple[int, bool]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tfbus.recording.recorder._WRITE_PERIOD", 0.0)
-    monkeypatch.setattr("tfbus.recording.recorder._FLUSH_PERIOD", 0.02)
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
-            for number in range(2):
-                bus.publish(moving("map", "a", number))
-                await until(lambda number=number: len(writes) == number + 1)  # type: ignore[misc]
-            # Nothing more is published.
-            await until(lambda: recorder.statistics().samples == 2)
-
-
-async def test_a_flush_and_the_end_do_not_wait_for_more_samples(
-    tmp_path: Path, writes: list[tuple[int, bool]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tfbus.recording.recorder._WRITE_PERIOD", PATIENCE)
-    with Bus(SimulatedClock()) as bus, anyio.fail_after(PATIENCE / 4):
-        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
-            bus.publish(moving("map", "a", 1))
-            await settle()
-            assert writes == []
-            await recorder.flush()
-            assert writes == [(1, True)]
-            bus.publish(moving("map", "a", 2))
-            await settle()
-    assert recorder.statistics().samples == 2
-
-
-async def test_what_a_message_cannot_hold_is_counted_and_not_pending(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, path) as recorder:
-            # A stamp of ROS has 31 bits for the seconds.
-            bus.publish([moving("map", "a", 2**31 * SECOND), moving("map", "b", 2**31 * SECOND - 1)])
-            await recorder.flush()
-            statistics = recorder.statistics()
+async def test_what_a_message_cannot_hold_is_counted_and_not_pending(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path) as recorder:
+        # A stamp of ROS has 31 bits for the seconds.
+        bus.publish([moving("map", "a", 2**31 * SECOND), moving("map", "b", 2**31 * SECOND - 1)])
+        await recorder.flush()
+        statistics = recorder.statistics()
     assert (statistics.samples, statistics.messages, sum(statistics.refused.values())) == (1, 1, 1)
     assert (statistics.queue.pending, offered(statistics)) == (0, 2)
 
 
-async def test_several_tasks_may_wait_for_a_flush(tmp_path: Path) -> None:
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, tmp_path / "run.mcap") as recorder, anyio.create_task_group() as tasks:
-            bus.publish(moving("map", "a", 1))
-            asked = [Asked(tasks, recorder.flush) for _ in range(3)]
-            await until(lambda: all(each.ended for each in asked))
-            assert recorder.statistics().samples == 1
+async def test_several_tasks_may_wait_for_a_flush(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path) as recorder, anyio.create_task_group() as tasks:
+        bus.publish(moving("map", "a", 1))
+        asked = [Asked(tasks, recorder.flush) for _ in range(3)]
+        await until(lambda: all(each.ended for each in asked))
+        assert recorder.statistics().samples == 1
 
 
-async def test_a_few_samples_are_written_soon_without_a_flush(tmp_path: Path) -> None:
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
-            bus.publish(moving("map", "a", 1))
+async def test_a_few_samples_are_written_soon_without_a_flush(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path) as recorder:
+        # The second one comes when a chunk has just ended, and nothing comes behind it.
+        for number in (1, 2):
+            bus.publish(moving("map", "a", number))
             assert recorder.statistics().queue.pending == 1
-            await until(lambda: recorder.statistics().samples == 1)
+            await until(lambda number=number: recorder.statistics().samples == number)  # type: ignore[misc]
 
 
-@pytest.mark.thorough
-async def test_samples_faster_than_the_disk_are_recorded_or_counted_as_dropped(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with Bus(SimulatedClock()) as bus, bus.events() as events:
-        bus.publish(static("map", "rig"))
-        async with Recorder(bus, path, capacity=4_000) as recorder:
-            for stamp in range(20_000):
-                # Nothing is awaited, so nothing can be written.
-                bus.publish((moving("map", "a", stamp),) if stamp % 2_000 else (static("map", f"s{stamp}"),))
-            statistics = recorder.statistics()
-            assert (statistics.samples, offered(statistics)) == (0, 20_001)
-            # The newest 4,000 batches, two of them static, and the nine static samples from before.
-            assert statistics.queue.pending == 4_009
-            assert recorder.bus is bus
-        statistics = recorder.statistics()
-        bus.close()
-        told = [event async for event in events if isinstance(event, RecordingDropped)]
-    assert statistics.queue.pending == 0
-    assert statistics.queue.dropped == 20_001 - 4_009
-    assert statistics.samples == 4_009 == sum(len(batch) for _, batch in recorded(path))
-    assert told == [RecordingDropped(0, str(path), 1)]
-    kept = [sample for _, batch in recorded(path) for sample in batch]
-    assert {sample.child for sample in kept if sample.static} == {
-        "rig",
-        *(f"s{2_000 * number}" for number in range(10)),
-    }
-    assert [sample.stamp for sample in kept if not sample.static] == [
-        stamp for stamp in range(16_000, 20_000) if stamp % 2_000
-    ]
-
-
-async def test_each_time_that_dropping_begins_there_is_one_event(tmp_path: Path) -> None:
+async def test_each_time_that_dropping_begins_there_is_one_event(path: Path) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         # Also if something is pending from the beginning on.
         bus.publish(static("map", "rig"))
-        async with Recorder(bus, tmp_path / "run.mcap", capacity=10) as recorder:
+        async with Recorder(bus, path, capacity=10) as recorder:
             for _ in range(2):
                 for sample in noise(15):
                     bus.publish(sample)
@@ -429,7 +256,7 @@ async def test_a_disk_that_hangs_does_not_block_publishers(pipe: Pipe) -> None:
     assert statistics.samples == pipe.messages()
 
 
-async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_file(pipe: Pipe) -> None:
+async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_file(bus: Bus, pipe: Pipe) -> None:
     recorders = []
 
     async def record(bus: Bus) -> None:
@@ -444,18 +271,16 @@ async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_
             pipe.drain()
             await anyio.sleep_forever()
 
-    with Bus(SimulatedClock()) as bus:
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(record, bus)
-        # It hears of nothing any more.
-        bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(record, bus)
+    # It hears of nothing any more.
+    bus.publish(moving("map", "a", 1))
     (recorder,) = recorders
     assert offered(recorder.statistics()) == recorder.statistics().samples == 6_000
     assert pipe.messages() == 6_000
 
 
-async def test_an_error_of_the_body_is_raised_as_it_is_and_the_file_is_whole(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+async def test_an_error_of_the_body_is_raised_as_it_is_and_the_file_is_whole(path: Path) -> None:
     with Bus(SimulatedClock()) as bus, pytest.raises(LookupError, match="the body's own"):
         async with Recorder(bus, path):
             bus.publish(moving("map", "a", 1))
@@ -507,9 +332,8 @@ def cut(path: Path) -> None:
 )
 @pytest.mark.parametrize("more", [True, False])
 async def test_a_file_that_is_removed_replaced_or_cut_meanwhile_ends_the_recording(
-    tmp_path: Path, harm: Callable[[Path], None], why: str, more: bool
+    path: Path, harm: Callable[[Path], None], why: str, more: bool
 ) -> None:
-    path = tmp_path / "run.mcap"
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         async with Recorder(bus, path) as recorder:
             bus.publish(moving("map", "a", 1))
@@ -527,28 +351,22 @@ async def test_a_file_that_is_removed_replaced_or_cut_meanwhile_ends_the_recordi
     assert (statistics.samples, statistics.messages, statistics.queue.dropped) == (0, 0, 3 if more else 1)
 
 
-async def test_a_file_that_is_moved_meanwhile_is_finished_and_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("move", [True, False])
+async def test_a_file_that_is_moved_is_finished_and_told_and_another_working_directory_is_no_harm(
+    bus: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, move: bool
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    moved = tmp_path / "moved.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, "run.mcap") as recorder:
-            bus.publish(moving("map", "a", 1))
-            await recorder.flush()
-            await anyio.to_thread.run_sync((tmp_path / "run.mcap").replace, moved)
-            bus.publish(moving("map", "a", 2))
-    assert "somebody moved the file" in str(recorder.error)
-    assert recorder.statistics().samples == len(recorded(moved)) == 2
-
-
-async def test_a_change_of_the_working_directory_is_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, "run.mcap") as recorder:
-            bus.publish(moving("map", "a", 1))
+    path, moved = tmp_path / "run.mcap", tmp_path / "moved.mcap"
+    async with Recorder(bus, "run.mcap") as recorder:
+        bus.publish(moving("map", "a", 1))
+        await recorder.flush()
+        if move:
+            await anyio.to_thread.run_sync(path.replace, moved)
+        else:
             monkeypatch.chdir("/")
-    assert recorder.error is None
+        bus.publish(moving("map", "a", 2))
+    assert ("somebody moved the file" in str(recorder.error)) == move
+    assert recorder.statistics().samples == len(recorded(moved if move else path)) == 2
 
 
 async def test_a_disk_that_fails_at_the_end_causes_an_event_and_raises_nothing(pipe: Pipe) -> None:
@@ -561,58 +379,17 @@ async def test_a_disk_that_fails_at_the_end_causes_an_event_and_raises_nothing(p
     assert isinstance(recorder.error, BrokenPipeError)
 
 
-async def test_flush_returns_when_the_disk_fails(pipe: Pipe) -> None:
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, pipe.path, overwrite=True) as recorder:
-            pipe.break_off()
-            for stamp in range(_SLICE + 1):
-                bus.publish(moving("map", "a", stamp))
-            with anyio.fail_after(PATIENCE):
-                await recorder.flush()
-            assert isinstance(recorder.error, BrokenPipeError)
-        queue = recorder.statistics().queue
-        # Also what was not passed to the disk yet.
-        assert (queue.pending, queue.dropped) == (0, _SLICE + 1)
-
-
-FULL_DISK = """
-import json, resource, sys, anyio
-from tfbus import Bus, TransformBroadcaster, Transform
-from tfbus.recording.recorder import Recorder
-
-async def main():
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
-    with Bus() as bus:
-        broadcaster = TransformBroadcaster(bus)
-        async with Recorder(bus, sys.argv[1]) as recorder:
-            stamp = 0
-            while recorder.error is None:
-                stamp += 1
-                broadcaster.send("map", "base", Transform((1 / stamp, 2 / stamp, 3 / stamp)), at=stamp)
-                await anyio.sleep(0)
-        queue = recorder.statistics().queue
-        print(json.dumps([recorder.error.errno, recorder.statistics().samples, queue.dropped, stamp]))
-
-anyio.run(main, backend=sys.argv[2])
-"""
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_samples_written_before_the_disk_was_full_can_be_read(tmp_path: Path, backend: str) -> None:
-    path = tmp_path / "run.mcap"
-    done = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, path, backend], capture_output=True, text=True, timeout=PATIENCE, check=True
-    )
-    code, samples, dropped, published = json.loads(done.stdout)
-    assert code == errno.EFBIG
-    assert samples > 0
-    assert samples + dropped == published
-    with open_recording(path) as recording:
-        stamps = [sample.stamp for message in recording.messages() for sample in message.batch]
-    # The chunk that did not fit may be whole, and only what belongs to it is missing.
-    assert samples <= len(stamps) < published
-    assert stamps == list(range(1, len(stamps) + 1))
+async def test_flush_returns_when_the_disk_fails(bus: Bus, pipe: Pipe) -> None:
+    async with Recorder(bus, pipe.path, overwrite=True) as recorder:
+        pipe.break_off()
+        for stamp in range(5_000):
+            bus.publish(moving("map", "a", stamp))
+        with anyio.fail_after(PATIENCE):
+            await recorder.flush()
+        assert isinstance(recorder.error, BrokenPipeError)
+    queue = recorder.statistics().queue
+    # Also what was not passed to the disk yet.
+    assert (queue.pending, queue.dropped) == (0, 5_000)
 
 
 KILLED = """
@@ -641,8 +418,7 @@ anyio.run(main, backend=sys.argv[2])
 @pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 @pytest.mark.parametrize("lines", [1, 3])
-def test_all_samples_but_the_last_ones_can_be_read_after_sigkill(tmp_path: Path, backend: str, lines: int) -> None:
-    path = tmp_path / "run.mcap"
+def test_all_samples_but_the_last_ones_can_be_read_after_sigkill(path: Path, backend: str, lines: int) -> None:
     command = [sys.executable, "-c", KILLED, str(path), backend]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -662,8 +438,7 @@ def test_all_samples_but_the_last_ones_can_be_read_after_sigkill(tmp_path: Path,
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_ctrl_c_leaves_a_whole_file(tmp_path: Path, backend: str) -> None:
-    path = tmp_path / "run.mcap"
+def test_ctrl_c_leaves_a_whole_file(path: Path, backend: str) -> None:
     command = [sys.executable, "-c", KILLED, str(path), backend]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -675,80 +450,73 @@ def test_ctrl_c_leaves_a_whole_file(tmp_path: Path, backend: str) -> None:
     assert [batch[0].stamp for _, batch in recorded(path)][:written] == list(range(written))
 
 
-async def test_an_existing_file_is_kept(tmp_path: Path) -> None:
+async def test_an_existing_file_is_kept(bus: Bus, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
-    with Bus(SimulatedClock()) as bus:
-        recorder = Recorder(bus, path)
-        with pytest.raises(FileExistsError):
-            await recorder.__aenter__()
-        bus.publish(moving("map", "a", 1))
-        assert offered(recorder.statistics()) == 0
-        assert path.read_text() == "precious"
-        async with Recorder(bus, path, overwrite=True):
-            bus.publish(moving("map", "a", 2))
+    recorder = Recorder(bus, path)
+    with pytest.raises(FileExistsError):
+        await recorder.__aenter__()
+    bus.publish(moving("map", "a", 1))
+    assert offered(recorder.statistics()) == 0
+    assert path.read_text() == "precious"
+    async with Recorder(bus, path, overwrite=True):
+        bus.publish(moving("map", "a", 2))
     assert len(recorded(path)) == 1
 
 
-async def test_a_recorder_that_cannot_start_raises(tmp_path: Path) -> None:
+async def test_a_recorder_that_cannot_start_raises(bus: Bus, tmp_path: Path, path: Path) -> None:
     full = tmp_path / "full.mcap"
     full.symlink_to("/dev/full")
-    with Bus(SimulatedClock()) as bus:
-        with pytest.raises(FileNotFoundError):
-            async with Recorder(bus, tmp_path / "nowhere" / "run.mcap"):
-                raise AssertionError("not reached")
-        with pytest.raises(OSError, match="No space"):
-            async with Recorder(bus, full, overwrite=True):
-                raise AssertionError("not reached")
-        bus.close()
-        with pytest.raises(BusClosedError):
-            async with Recorder(bus, tmp_path / "run.mcap"):
-                raise AssertionError("not reached")
+    with pytest.raises(FileNotFoundError):
+        async with Recorder(bus, tmp_path / "nowhere" / "run.mcap"):
+            raise AssertionError("not reached")
+    with pytest.raises(OSError, match="No space"):
+        async with Recorder(bus, full, overwrite=True):
+            raise AssertionError("not reached")
+    bus.close()
+    with pytest.raises(BusClosedError):
+        async with Recorder(bus, path):
+            raise AssertionError("not reached")
     assert not (tmp_path / "run.mcap").exists()
 
 
-async def test_a_recorder_cancelled_while_opening_its_file_leaves_nothing_behind(tmp_path: Path) -> None:
+async def test_a_recorder_cancelled_while_opening_its_file_leaves_nothing_behind(bus: Bus, tmp_path: Path) -> None:
     path = tmp_path / "pipe.mcap"
     os.mkfifo(path)
-    with Bus(SimulatedClock()) as bus:
-        recorder = Recorder(bus, path, overwrite=True)
-        async with anyio.create_task_group() as tasks:
-            asked = Asked(tasks, recorder.__aenter__)
-            await settle()
-            asked.cancel()
-            await settle()
-            # A pipe opens when there is a reader.
-            assert not asked.ended
-            data = await anyio.to_thread.run_sync(path.read_bytes)
-        assert asked.cancelled
-        bus.publish(moving("map", "a", 1))
+    recorder = Recorder(bus, path, overwrite=True)
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, recorder.__aenter__)
+        await settle()
+        asked.cancel()
+        await settle()
+        # A pipe opens when there is a reader.
+        assert not asked.ended
+        data = await anyio.to_thread.run_sync(path.read_bytes)
+    assert asked.cancelled
+    bus.publish(moving("map", "a", 1))
     assert offered(recorder.statistics()) == 0
     assert list(make_reader(BytesIO(data)).iter_messages()) == []
 
 
-async def test_a_recorder_is_entered_only_once_and_before_flush(tmp_path: Path) -> None:
-    with Bus(SimulatedClock()) as bus:
-        recorder = Recorder(bus, tmp_path / "run.mcap")
-        with pytest.raises(RuntimeError, match="enter the recorder first"):
-            await recorder.flush()
-        async with recorder:
-            with pytest.raises(RuntimeError, match="entered once"):
-                await recorder.__aenter__()
-        with pytest.raises(ValueError, match="capacity"):
-            Recorder(bus, tmp_path / "other.mcap", capacity=0)
+async def test_a_recorder_is_entered_only_once_and_before_flush(bus: Bus, tmp_path: Path, path: Path) -> None:
+    recorder = Recorder(bus, path)
+    with pytest.raises(RuntimeError, match="enter the recorder first"):
+        await recorder.flush()
+    async with recorder:
+        with pytest.raises(RuntimeError, match="entered once"):
+            await recorder.__aenter__()
+    with pytest.raises(ValueError, match="capacity"):
+        Recorder(bus, tmp_path / "other.mcap", capacity=0)
 
 
-async def test_a_bus_that_is_closed_in_the_body_ends_nothing_else(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with Bus(SimulatedClock()) as bus:
-        async with Recorder(bus, path):
-            bus.publish(moving("map", "a", 1))
-            bus.close()
+async def test_a_bus_that_is_closed_in_the_body_ends_nothing_else(bus: Bus, path: Path) -> None:
+    async with Recorder(bus, path):
+        bus.publish(moving("map", "a", 1))
+        bus.close()
     assert len(recorded(path)) == 1
 
 
-async def test_after_a_jump_back_of_the_clock_the_times_in_the_file_go_back_too(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+async def test_after_a_jump_back_of_the_clock_the_times_in_the_file_go_back_too(path: Path) -> None:
     clock = SimulatedClock(9 * SECOND)
     with Bus(clock) as bus:
         async with Recorder(bus, path) as recorder:
@@ -761,8 +529,7 @@ async def test_after_a_jump_back_of_the_clock_the_times_in_the_file_go_back_too(
     assert times == [9 * SECOND, 5 * SECOND]
 
 
-def test_under_plain_asyncio_a_timeout_leaves_a_whole_file(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_under_plain_asyncio_a_timeout_leaves_a_whole_file(path: Path) -> None:
 
     async def record(bus: Bus, started: asyncio.Event) -> None:
         async with Recorder(bus, path):
@@ -786,28 +553,68 @@ def test_under_plain_asyncio_a_timeout_leaves_a_whole_file(tmp_path: Path) -> No
     assert len(recorded(path)) == 5_000
 
 
-def test_under_plain_asyncio_a_recorder_cancelled_while_opening_leaves_nothing_behind(tmp_path: Path) -> None:
-    path = tmp_path / "pipe.mcap"
-    os.mkfifo(path)
-
-    async def main() -> bytes:
-        with Bus(SimulatedClock()) as bus:
-            task = asyncio.create_task(Recorder(bus, path, overwrite=True).__aenter__())
-            await asyncio.sleep(0.01)
-            task.cancel()
-            data = await asyncio.to_thread(path.read_bytes)
-            with pytest.raises(asyncio.CancelledError):
-                await task
-            return data
-
-    assert list(make_reader(BytesIO(asyncio.run(main()))).iter_messages()) == []
-
-
-def test_the_repr_is_one_line_with_file_and_samples(tmp_path: Path) -> None:
-    recorder = Recorder(Bus(), tmp_path / "run.mcap")
+def test_a_recorder_that_has_not_begun_has_a_name_and_counts_nothing(tmp_path: Path, path: Path) -> None:
+    recorder = Recorder(Bus(), path, capacity=7)
     assert repr(recorder) == f"<Recorder of {str(tmp_path / 'run.mcap')!r}: 0 samples>"
-
-
-def test_before_it_begins_nothing_is_counted(tmp_path: Path) -> None:
     queue = QueueStatistics("recording", "drop_oldest", 7, 0, 0)
-    assert Recorder(Bus(), tmp_path / "run.mcap", capacity=7).statistics() == RecorderStatistics(0, 0, 0, {}, queue)
+    assert recorder.statistics() == RecorderStatistics(0, 0, 0, {}, queue)
+
+
+def test_a_slice_has_at_least_one_batch_and_otherwise_no_more_samples_than_its_size() -> None:
+    queue = WriteQueue(100)
+    for size in (2, 3, 9, 1):
+        queue.put(tuple(moving("map", "a", stamp) for stamp in range(size)), 0)
+    assert [[len(batch) for _, batch in queue.get_slice(5)] for _ in range(3)] == [[2, 3], [9], [1]]
+
+
+def test_static_samples_of_dropped_batches_come_first_with_their_own_times() -> None:
+    queue = WriteQueue(1)
+    queue.put((static("map", "a"), moving("map", "b", 1)), 0)
+    queue.put((static("map", "c"), moving("map", "b", 2)), 1)
+    queue.put((moving("map", "b", 3),), 2)
+    assert len(queue) == 3
+    assert queue.get_slice(10) == [
+        (0, (static("map", "a"),)),
+        (1, (static("map", "c"),)),
+        (2, (moving("map", "b", 3),)),
+    ]
+
+
+def test_batches_of_static_samples_alone_are_bounded_and_the_replaced_ones_are_counted() -> None:
+    queue = WriteQueue(3)
+    for number in range(1_000):
+        queue.put((static("map", f"s{number % 2}", x=float(number)),), number)
+    assert queue.statistics("recording") == QueueStatistics("recording", "drop_oldest", 3, 5, 0, 995)
+    assert [sample.transform.translation[0] for _, (sample,) in queue.get_slice(10)] == [995, 996, 997, 998, 999]
+
+
+steps = st.lists(st.lists(any_samples("abc", 3), min_size=1, max_size=5) | st.integers(1, 8), max_size=40)
+
+
+def count_moving(samples: list[TransformStamped]) -> int:
+    return sum(not sample.static for sample in samples)
+
+
+@given(steps, st.integers(1, 6))
+def test_every_sample_is_read_or_counted_and_the_newest_static_ones_are_read(
+    steps: list[list[TransformStamped] | int], capacity: int
+) -> None:
+    queue = WriteQueue(capacity)
+    put: list[TransformStamped] = []
+    read: list[tuple[int, TransformStamped]] = []
+    for now, step in enumerate(steps):
+        if isinstance(step, int):
+            read += [(published, sample) for published, batch in queue.get_slice(step) for sample in batch]
+        else:
+            queue.put(tuple(step), now)
+            put += step
+    # Within the capacity, except for a single batch that is larger.
+    assert count_moving(put) - queue.dropped - count_moving([sample for _, sample in read]) <= max(capacity, 5)
+    while batches := queue.get_slice(3):
+        read += [(published, sample) for published, batch in batches for sample in batch]
+    assert len(put) == len(read) + queue.dropped + queue.conflated
+    assert queue.dropped <= count_moving(put)
+    times = [published for published, _ in read]
+    assert times == sorted(times)
+    newest = {sample.child: sample for sample in put if sample.static}
+    assert {sample.child: sample for _, sample in read if sample.static} == newest

@@ -1,3 +1,5 @@
+"""Which files are recordings, which topics of them are read, and what is told about the rest."""
+
 import errno
 import gzip
 import math
@@ -8,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.writer import Writer
@@ -19,6 +22,8 @@ from support.samples import moving, static
 
 from tfbus import InvalidTransformError, RecordingError
 from tfbus.recording import RecordedTopic, open_recording
+from tfbus.recording.formats.storage import Channel
+from tfbus.recording.recording import Choice, Selection, looks_like_transforms
 from tfbus.tf_message import encode
 
 SECOND = 1_000_000_000
@@ -47,13 +52,6 @@ def test_the_content_of_a_file_decides_its_format_not_its_name(tmp_path: Path, r
         assert unnamed == named
 
 
-def test_a_path_may_be_a_str_or_a_path(recording: Path) -> None:
-    for path in (recording, str(recording), os.fspath(recording)):
-        with open_recording(path) as opened:
-            assert opened.path == recording
-            assert len(list(opened.messages())) == len(LINES)
-
-
 def test_a_range_begins_with_the_newest_static_transform_of_each_frame_from_before(recording: Path) -> None:
     first, second, third, fourth = messages_in(recording, 35, 50)
     assert [message.received for message in (first, second)] == [35, 35]
@@ -63,19 +61,21 @@ def test_a_range_begins_with_the_newest_static_transform_of_each_frame_from_befo
     assert (fourth.received, fourth.batch) == (50, (static("base", "laser", 3.0),))
 
 
-def test_a_static_transform_at_the_start_of_a_range_comes_only_once(recording: Path) -> None:
-    assert [message.received for message in messages_in(recording, 10)] == [10, 20, 30, 40, 50]
-    assert [message.received for message in messages_in(recording, 11)] == [11, 11, 20, 30, 40, 50]
-
-
-def test_a_range_after_the_end_has_the_latest_static_transforms(recording: Path) -> None:
-    batches = [message.batch for message in messages_in(recording, 10 * SECOND)]
-    assert batches == [(static("base", "camera", 1.0),), (static("base", "laser", 3.0),)]
-
-
-def test_an_empty_range_is_empty(recording: Path) -> None:
-    assert messages_in(recording, until=9) == []
-    assert messages_in(recording, since=5, until=3) == []
+@pytest.mark.parametrize(
+    ("since", "until", "times"),
+    [
+        (10, None, [10, 20, 30, 40, 50]),
+        # A static transform of each of two frames from before.
+        (11, None, [11, 11, 20, 30, 40, 50]),
+        (10 * SECOND, None, [10 * SECOND] * 2),
+        (None, 9, []),
+        (5, 3, []),
+    ],
+)
+def test_a_range_has_its_messages_and_each_static_transform_once(
+    recording: Path, since: int | None, until: int | None, times: list[int]
+) -> None:
+    assert [message.received for message in messages_in(recording, since, until)] == times
 
 
 def test_good_transforms_come_with_the_errors_of_the_bad_ones(tmp_path: Path) -> None:
@@ -173,19 +173,16 @@ def test_a_topic_that_is_not_there_is_refused_with_ten_that_are(tmp_path: Path) 
     assert not is_open(path)
 
 
-def test_a_file_that_does_not_exist_is_missing(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_opened_is_missing_or_unreadable(tmp_path: Path) -> None:
     for path in (tmp_path / "run.mcap", tmp_path / "no folder" / "run.mcap"):
         with pytest.raises(RecordingError, match="there is no such file") as raised:
             open_recording(path)
         assert raised.value.reason == "missing"
-
-
-def test_a_file_that_cannot_be_opened_is_unreadable(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(path))
         with pytest.raises(RecordingError) as raised:
-            open_recording(path)
+            open_recording(str(path))
     assert str(raised.value) == f"recording {str(path)!r}: it cannot be read: {os.strerror(errno.ENXIO)}"
     assert raised.value.reason == "unreadable"
 
@@ -222,7 +219,7 @@ def write_channels(path: Path, topics: Sequence[str], lines: Iterable[tuple[int,
     return path
 
 
-TF_TYPE = "tf2_msgs/msg/TFMessage"
+TF = "tf2_msgs/msg/TFMessage"
 
 
 @pytest.mark.parametrize("finish", [True, False])
@@ -234,14 +231,14 @@ def test_all_topics_are_told_and_those_that_may_hold_transforms_and_are_not_read
     with open_recording(path) as recording:
         assert len(without_unfinished(recording.messages())) == 1
         assert recording.topics == (
-            RecordedTopic("/r/tf", TF_TYPE, 2, read=False, ignored=True),
-            RecordedTopic("/tf", TF_TYPE, 1, read=True, ignored=False),
+            RecordedTopic("/r/tf", TF, 2, read=False, ignored=True),
+            RecordedTopic("/tf", TF, 1, read=True, ignored=False),
         )
-        assert recording.remarks == (f"not read: 2 messages on topic /r/tf of type {TF_TYPE}",)
+        assert recording.remarks == (f"not read: 2 messages on topic /r/tf of type {TF}",)
     with open_recording(path) as recording:
         next(recording.messages())
         count = "2 messages on " if finish else ""
-        assert recording.remarks == (f"not read: {count}topic /r/tf of type {TF_TYPE}",)
+        assert recording.remarks == (f"not read: {count}topic /r/tf of type {TF}",)
     with open_recording(write_mcap(path, [(1, "/camera/tf", one), (2, "/camera", b"")], schema="")) as recording:
         assert [(topic.name, topic.ignored) for topic in recording.topics] == [("/camera", False), ("/camera/tf", True)]
         assert recording.remarks == ("not read: 1 messages on topic /camera/tf of type unknown",)
@@ -277,17 +274,12 @@ def test_a_topic_that_was_asked_for_is_there_with_transforms(tmp_path: Path) -> 
         assert without_unfinished(recording.messages()) == []
 
 
-def test_a_topic_without_messages_adds_nothing_to_their_number(tmp_path: Path) -> None:
-    with open_recording(write_channels(tmp_path / "run.mcap", ("/tf", "/tf_static"), [(1, 0)])) as recording:
-        assert recording.count == 1
-        assert [topic.name for topic in recording.topics] == ["/tf", "/tf_static"]
-        assert [(message.received, message.errors) for message in recording.messages()] == [(1, ())]
-
-
-def test_two_channels_of_one_topic_and_type_are_one_topic_with_the_messages_of_both(tmp_path: Path) -> None:
-    path = write_channels(tmp_path / "run.mcap", ("/tf", "/tf"), [(1, 0), (2, 1), (3, 1)])
+def test_channels_of_one_topic_and_type_are_one_topic_and_a_silent_one_adds_nothing(tmp_path: Path) -> None:
+    path = write_channels(tmp_path / "run.mcap", ("/tf", "/tf", "/tf_static"), [(1, 0), (2, 1), (3, 1)])
     with open_recording(path) as recording:
-        assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", 3)]
+        assert recording.count == 3
+        assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", 3), ("/tf_static", 0)]
+        assert [(message.received, message.errors) for message in recording.messages()] == [(k, ()) for k in (1, 2, 3)]
 
 
 @pytest.mark.parametrize("names", [("a.mcap", "b.mcap"), ("b.mcap", "a.mcap")])
@@ -303,3 +295,73 @@ def test_the_number_of_messages_of_a_topic_is_not_known_if_one_of_its_files_does
         assert len(without_unfinished(messages)) == 1
         # Now both have been read.
         assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", 2)]
+
+
+TF = "tf2_msgs/msg/TFMessage"
+
+
+def tf(topic: str, kind: str = TF, encoding: str = "cdr") -> Channel:
+    return Channel(topic, kind, encoding)
+
+
+KINDS = [TF, "tf2_msgs/TFMessage", "tf/tfMessage", "tf/msg/tfMessage"]
+MANY, SINGLE = ("foxglove.FrameTransforms", "protobuf"), ("foxglove_msgs/msg/FrameTransform", "cdr")
+SEVERAL = {"topics": {"/robot1/tf": "r1/", "/fixed_static": "f/"}, "prefix": "fleet/"}
+EVERYTHING = {"namespaces": True, "prefix": "x/"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "channel", "choice"),
+    [
+        *(({}, tf(topic, kind), Choice(False, "")) for topic in ("/tf", "tf") for kind in KINDS),
+        *(({"prefix": "r/"}, tf(topic), Choice(True, "r/")) for topic in ("/tf_static", "tf_static")),
+        *(({}, tf(topic), None) for topic in ("/robot1/tf", "/TF", "/tf/", "//tf", "", "/", "/tf_stat", "/my_tf")),
+        *(({}, tf(topic, *MANY), Choice(False, "")) for topic in ("/tf", "/transforms", "/robot1/transforms")),
+        *(({}, tf("/transforms", *SINGLE), Choice(False, "")), ({}, tf("/robot1/tf", *SINGLE), None)),
+        *(({"topics": topics}, tf("/robot1/tf"), Choice(False, "")) for topics in ("/robot1/tf", ["robot1/tf"])),
+        *(({"topics": topics}, tf("/tf"), None) for topics in ("/robot1/tf", {"/robot1/tf": ""})),
+        (SEVERAL, tf("robot1/tf"), Choice(False, "fleet/r1/")),
+        (SEVERAL, tf("/fixed_static"), Choice(True, "fleet/f/")),
+        (EVERYTHING, tf("/tf"), Choice(False, "x/")),
+        (EVERYTHING, tf("/robot1/tf"), Choice(False, "x/robot1/")),
+        (EVERYTHING, tf("/a/b/tf_static"), Choice(True, "x/a/b/")),
+        (EVERYTHING, tf("/my_tf"), None),
+    ],
+)
+def test_topics_are_read_by_default_or_as_chosen_with_prefixes(
+    arguments: dict[str, Any], channel: Channel, choice: Choice | None
+) -> None:
+    assert Selection(**arguments).choose(channel) == choice
+
+
+@pytest.mark.parametrize(
+    ("channel", "mentioned"),
+    [
+        (tf("/tf", ""), True),
+        (tf("/tf", "geometry_msgs/msg/TransformStamped"), True),
+        (tf("/tf", "tf2_msgs/msg/tfmessage"), True),
+        (tf("/tf", TF, "protobuf"), True),
+        (tf("/tf", "foxglove.FrameTransform", "cbor"), True),
+        (tf("/robot1/tf", "std_msgs/msg/String"), True),
+        (tf("/x"), True),
+        (tf("/x", "std_msgs/msg/String"), False),
+    ],
+)
+def test_what_may_be_transforms_and_is_not_read_is_mentioned(channel: Channel, mentioned: bool) -> None:
+    assert Selection().choose(channel) is None
+    assert looks_like_transforms(channel) == mentioned
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        ({"topics": ["/tf"], "namespaces": True}, ValueError),
+        ({"prefix": "/r"}, ValueError),
+        ({"topics": {"/tf": "/r"}}, ValueError),
+        ({"topics": [3]}, TypeError),
+        ({"topics": {"/tf": 3}}, TypeError),
+    ],
+)
+def test_wrong_choices_are_refused(arguments: dict[str, Any], error: type[Exception]) -> None:
+    with pytest.raises(error):
+        Selection(**arguments)

@@ -26,11 +26,6 @@ def test_what_was_saved_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
     assert load_static(tmp_path / "empty.json") == []
 
 
-def test_a_moving_sample_becomes_static_with_the_stamp_0(tmp_path: Path) -> None:
-    save_static(tmp_path / "a.json", [moving("map", "base", 7, 2.0)])
-    assert load_static(tmp_path / "a.json", authority="me") == [static("map", "base", 2.0, 0, "me")]
-
-
 def test_plain_data_of_samples_are_entries_and_a_tree_is_filled_by_them(tmp_path: Path) -> None:
     file = tmp_path / "a.json"
     entries = [static("base", "lidar", 2.0, 5, "survey"), moving("base", "camera", 7, 3.0)]

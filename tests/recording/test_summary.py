@@ -1,24 +1,35 @@
+"""What a recording holds in numbers, and what is suspicious in it."""
+
 import dataclasses
 import pickle
+import struct
+from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
-from support.recorded import SMALL, WRONG_IN_SMALL, messages_in, real, write_mcap
+from support.processes import peak_of
+from support.recorded import SMALL, WRONG_IN_SMALL, Line, messages_in, real, write_blocks, write_mcap
 from support.samples import any_samples, moving, static
 
-from tfbus import TransformStamped
-from tfbus.recording import FrameSummary, RecordedMessage, RecordingSummary, load, open_recording, summarise
-from tfbus.recording.formats import mcap
+from tfbus import SECOND, TransformStamped
+from tfbus.recording import FrameSummary, RecordedMessage, RecordingSummary, examine, load, open_recording, summarise
 from tfbus.recording.formats.mcap_output import McapOutput
+from tfbus.recording.summary import Durations, Periods
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
+from tfbus.tf_message import encode
 
-SECOND = 1_000_000_000
 MS = 1_000_000
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
 
 
 def summary_of(path: Path) -> RecordingSummary:
@@ -26,10 +37,14 @@ def summary_of(path: Path) -> RecordingSummary:
         return summarise(recording)
 
 
+def sent(samples: Sequence[TransformStamped]) -> list[Line]:
+    """A message for each sample."""
+    return [(time, "/tf_static" if sample.static else "/tf", [sample]) for time, sample in enumerate(samples)]
+
+
 def frame_in(path: Path, samples: Sequence[TransformStamped]) -> FrameSummary:
     """The summary of the only frame in a recording."""
-    lines = [(time, "/tf_static" if sample.static else "/tf", [sample]) for time, sample in enumerate(samples)]
-    (frame,) = summary_of(write_mcap(path / "run.mcap", lines)).frames
+    (frame,) = summary_of(write_mcap(path / "run.mcap", sent(samples))).frames
     return frame
 
 
@@ -91,21 +106,10 @@ def test_a_frame_with_static_and_moving_samples_has_both_kinds(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("kinds", ["ms", "sm", "ss", "mm", "mss", "smm"])
-def test_samples_of_each_kind_are_counted_in_whatever_block_they_come(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kinds: str
-) -> None:
-    monkeypatch.setattr(mcap, "_FIRST_BLOCK", 1)
+def test_samples_of_each_kind_are_counted_in_whatever_block_they_come(path: Path, kinds: str) -> None:
     samples = [static("a", "b") if kind == "s" else moving("a", "b", at) for at, kind in enumerate(kinds)]
-    lines = [(at, "/tf_static" if sample.static else "/tf", [sample]) for at, sample in enumerate(samples)]
-    # Each has a block of its own.
-    (frame,) = summary_of(write_mcap(tmp_path / "run.mcap", lines, chunk_size=1)).frames
-    assert (frame.static, frame.moving) == (kinds.count("s"), kinds.count("m"))
-
-
-def test_an_empty_recording_has_an_empty_summary(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "run.mcap", [])
-    assert summary_of(path) == RecordingSummary(path, True, None, None, 0, 0, (), (), {})
-    assert summary_of(path).duration is None
+    frames = {each.frame: each for each in summary_of(write_blocks(path, sent(samples))).frames}
+    assert (frames["b"].static, frames["b"].moving) == (kinds.count("s"), kinds.count("m"))
 
 
 def test_the_summary_shows_an_unfinished_and_damaged_file(tmp_path: Path) -> None:
@@ -158,13 +162,9 @@ def test_the_samples_left_out_are_those_left_out_of_a_loaded_tree(
     ],
 )
 def test_the_newest_parent_of_a_frame_decides_what_closes_a_loop(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: list[TransformStamped], loops: int
+    tmp_path: Path, lines: list[TransformStamped], loops: int
 ) -> None:
-    # Each message is a block of its own.
-    monkeypatch.setattr(mcap, "_FIRST_BLOCK", 1)
-    monkeypatch.setattr(mcap, "_BLOCK", 1)
-    sent = [(k, "/tf_static" if sample.static else "/tf", [sample]) for k, sample in enumerate(lines)]
-    path = write_mcap(tmp_path / "run.mcap", sent, chunk_size=1)
+    path = write_blocks(tmp_path / "run.mcap", sent(lines))
     counted: list[int] = []
     with open_recording(path) as recording:
         summary = summarise(recording, progress=counted.append)
@@ -188,17 +188,14 @@ def test_summarise_reads_the_messages_that_are_given() -> None:
     assert len(seen) == len(messages_in(SMALL))
 
 
-def test_a_summary_is_frozen_data() -> None:
+def test_a_summary_is_frozen_data(tmp_path: Path) -> None:
     summary = summary_of(SMALL)
     assert pickle.loads(pickle.dumps(summary)) == summary
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        summary.messages = 0  # type: ignore[misc]
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        summary.frames[0].moving = 0  # type: ignore[misc]
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        summary.senders[0].moving = 0  # type: ignore[misc]
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        summary.topics[0].count = 0  # type: ignore[misc]
+    for each, name in ((summary, "messages"), (summary.frames[0], "moving"), (summary.senders[0], "moving")):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(each, name, 0)
+    path = write_mcap(tmp_path / "run.mcap", [])
+    assert summary_of(path) == RecordingSummary(path, True, None, None, 0, 0, (), (), {})
 
 
 def test_a_duration_or_a_span_needs_both_ends() -> None:
@@ -219,18 +216,18 @@ def test_the_summary_of_a_real_robot() -> None:
     assert {frame.moving for frame in summary.frames if frame.moving} == {153}
 
 
-def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(tmp_path: Path) -> None:
+def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(path: Path) -> None:
     # 4,000 samples at 100 Hz, each received 3 ms after its stamp, but for the last: 5 ms, from another sender.
     lines = [(10 * MS * k + 3 * MS, moving("a", "b", 10 * MS * k, float(k), "one")) for k in range(3_999)]
     lines.append((39_990 * MS + 5 * MS, moving("a", "b", 39_990 * MS, 0.0, "two")))
     # A late sample of another parent leaves the newest edge as it is, so the next one closes no loop.
     lines.append((40_000 * MS, moving("c", "b", 39_985 * MS, 0.0, "one")))
     lines.append((40_001 * MS, moving("b", "c", 40_001 * MS, 0.0, "three")))
-    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
+    with closing(McapOutput(str(path), overwrite=True)) as output:
         output.write([(received, (sample,)) for received, sample in lines])
         output.finish()
     counted: list[int] = []
-    with open_recording(tmp_path / "run.mcap") as recording:
+    with open_recording(path) as recording:
         summary = summarise(recording, progress=counted.append)
         one_by_one = summarise(recording, recording.messages())
     # The first one names the frame, the last one has to be judged.
@@ -247,3 +244,116 @@ def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(tmp_path
     assert b.delay.max == 0.015
     senders = {sender.authority: (sender.frames, sender.moving) for sender in summary.senders}
     assert senders == {"one": (("b",), 4_000), "two": (("b",), 1), "three": (("c",), 1)}
+
+
+delays = st.lists(st.integers(-(10**15), 10**15), min_size=1, max_size=300)
+
+
+@example(parts=[[1] * 98, [2, 3]], singles=[])
+@example(parts=[[10**9] * 197 + [10**11] * 3], singles=[])
+@given(parts=st.lists(delays, min_size=1, max_size=3), singles=st.lists(st.integers(-(10**15), 10**15), max_size=3))
+def test_mean_and_maximum_are_exact_and_the_quantile_is_within_1_percent(
+    parts: list[list[int]], singles: list[int]
+) -> None:
+    counted = []
+    for part in parts:
+        each = Durations()
+        each.add(np.array(part))
+        for duration in singles:
+            each.add_one(duration)
+        part += singles
+        counted.append(each)
+    spread = Durations.joined(counted).spread()
+    assert spread is not None
+    whole = sorted(delay for part in parts for delay in part)
+    assert spread.mean == pytest.approx(sum(whole) / len(whole) / SECOND, rel=1e-9, abs=1e-9)
+    assert spread.max == whole[-1] / SECOND
+    exact = whole[-(-99 * len(whole) // 100) - 1] / SECOND
+    assert spread.p99 == pytest.approx(exact, rel=0.0101, abs=1e-12)
+    assert spread.p99 <= spread.max
+
+
+@pytest.mark.parametrize("at_once", [1, 999])
+def test_durations_that_come_in_few_take_no_more_memory_the_more_there_are(at_once: int) -> None:
+    durations = Durations()
+
+    def count() -> None:
+        for _ in range(30_000 // at_once):
+            if at_once == 1:
+                durations.add_one(7)
+            else:
+                durations.add(np.full(at_once, 7))
+
+    # Half of what they would take, at 8 bytes each.
+    assert peak_of(count) < 30_000 * 8 / 2
+
+
+@pytest.mark.parametrize("at_once", [1, 7, 999, 1_000, 1_001, 2_500])
+def test_thousands_are_all_counted_however_many_come_at_once(at_once: int) -> None:
+    durations = Durations()
+    whole = SECOND * np.arange(1, 2_501)
+    for begin in range(0, 2_500, at_once):
+        if at_once == 1:
+            durations.add_one(int(whole[begin]))
+        else:
+            durations.add(whole[begin : begin + at_once])
+    spread = durations.spread()
+    assert spread is not None
+    assert (spread.mean, spread.max) == (1_250.5, 2_500.0)
+    assert 2_475.0 <= spread.p99 <= 2_475.0 * 1.0101
+    assert Durations().spread() is None
+
+
+columns = st.lists(st.lists(st.integers(0, 10**4), max_size=60), max_size=4)
+
+
+@given(columns=columns)
+@example(columns=[])
+@example(columns=[[*range(60_000)], [*range(30_000, 130_000)]])
+@example(columns=[[5], [], [5, 5]])
+@example(columns=[[5], [7, 7]])
+@example(columns=[[9, 3, 6], [0, 3, 1]])
+@example(columns=[[3, 0], [9, 12, 10]])
+def test_the_periods_are_those_of_all_different_stamps(columns: list[list[int]]) -> None:
+    periods = Periods([array("q", [stamp * SECOND for stamp in column]) for column in columns])
+    stamps = sorted({stamp for column in columns for stamp in column})
+    differences = np.diff(stamps)
+    assert periods.oldest == (stamps[0] * SECOND if stamps else None)
+    assert periods.newest == (stamps[-1] * SECOND if stamps else None)
+    spread = periods.spread()
+    if len(stamps) < 2:
+        assert (periods.rate, periods.longest, spread) == (None, None, None)
+        return
+    assert spread is not None
+    assert periods.rate == pytest.approx(1 / differences.mean())
+    assert periods.longest == spread.max == differences.max()
+    assert spread.mean == pytest.approx(differences.mean(), rel=1e-12)
+    assert spread.p99 == pytest.approx(sorted(differences)[-(-99 * len(differences) // 100) - 1], rel=0.0101)
+
+
+def test_a_recording_is_examined_as_it_arrived_with_the_norms_as_they_were_sent(path: Path) -> None:
+    uneven = bytearray(encode([moving("odom", "base", 3 * SECOND)]))
+    uneven[-8:] = struct.pack("<d", 1.005)
+    lines: list[Line] = [
+        *((k * SECOND, "/tf", [moving("odom", "base", k * SECOND)]) for k in range(3)),
+        (3 * SECOND, "/tf", bytes(uneven)),
+        (4 * SECOND, "/tf", [moving("odom", "base", 2 * SECOND)]),
+        (5 * SECOND, "/tf", b"nonsense"),
+    ]
+    blocks: list[int] = []
+    with open_recording(write_mcap(path, lines)) as recording:
+        found = [
+            (each.kind, each.frame, each.count, each.first, each.worst)
+            for each in examine(recording, progress=blocks.append)
+        ]
+        late = [each.kind for each in examine(recording, since=4 * SECOND, until=4 * SECOND)]
+    assert found[0][:3] == ("refused", None, 1)
+    assert [each[:4] for each in found[1:3]] == [
+        ("stamps go back", "base", 1, 2 * SECOND),
+        ("duplicate stamps", "base", 1, 2 * SECOND),
+    ]
+    kind, _, count, first, worst = found[3]
+    assert (kind, count, first) == ("rotation", 1, 3 * SECOND)
+    assert worst is not None
+    assert abs(worst - 0.005) < 1e-12
+    assert (sum(blocks), late) == (6, [])

@@ -76,6 +76,12 @@ def write_mcap(
     return path
 
 
+def write_blocks(path: Path, lines: Iterable[Line]) -> Path:
+    """A file whose messages are read in a block each, as each shares its chunk with a large picture."""
+    spaced = [each for line in lines for each in (line, (line[0], "/camera", bytes(2**21)))]
+    return write_mcap(path, spaced, chunk_size=2**21, compression=CompressionType.ZSTD)
+
+
 def as_ros2(bag: Path, folder: Path, storage: StoragePlugin, **options: Any) -> Path:
     """The transforms of a bag of ROS 1 as ROS 2 records them, in a folder, by the writer of `rosbags`."""
     types = get_typestore(Stores.ROS2_HUMBLE)

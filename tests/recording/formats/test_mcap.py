@@ -1,25 +1,45 @@
+"""MCAP files of every layout, whole and harmed, and their records byte by byte."""
+
 import os
 import random
+import struct
 import tracemalloc
+import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from functools import partial
+from io import BytesIO
+from itertools import accumulate, cycle, islice
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zstandard
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
+from mcap.records import ChunkIndex, McapRecord
 from mcap.writer import CompressionType, IndexType, Writer
-from rosbags.typesys import Stores, get_typestore
-from support.recorded import batches_in, facts, messages_in, without_unfinished, write_mcap
+from support.recorded import Line, batches_in, facts, messages_in, without_unfinished, write_blocks, write_mcap
 from support.samples import moving, static
 
-from tfbus import RecordingError, TransformStamped
+from tfbus import RecordingError
 from tfbus.recording import RecordedMessage, open_recording
-from tfbus.recording.formats import mcap, mcap_records
+from tfbus.recording.formats import mcap_records
+from tfbus.recording.formats.mcap import ChunkPacker, McapReading, McapStorage, OpenChunk
+from tfbus.recording.formats.mcap_records import (
+    DAMAGE,
+    MAGIC,
+    Chunk,
+    parse_record,
+    read_records,
+    record_places,
+    split_chunk,
+)
+from tfbus.recording.formats.storage import Channel, ChunkPlace, Packed, UnfoldError
 from tfbus.stamps import STAMP_MAX
 from tfbus.tf_message import encode
 
@@ -102,22 +122,6 @@ def test_a_file_with_an_index_knows_the_count_of_its_messages(write: Write) -> N
         assert errors_in(messages) == []
 
 
-def test_a_file_without_an_index_does_not_know_the_count_of_its_messages(write: Write) -> None:
-    with open_recording(write(LINES, finish=False)) as recording:
-        assert facts(recording) == (10, 99 + COUNT, None, False)
-
-
-def test_an_index_is_used_up_to_its_bound(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write(LINES)
-    data = path.read_bytes()
-    # The footer says where the index begins.
-    size = len(data) - int.from_bytes(data[-28:-20], "little")
-    for bound, count in ((size, COUNT + 1), (size - 1, None)):
-        monkeypatch.setattr("tfbus.recording.formats.mcap.MAX_INDEX", bound)
-        with open_recording(path) as recording:
-            assert recording.count == count
-
-
 def test_the_shortest_finished_file_is_an_empty_recording_and_with_a_byte_less_it_is_cut_off(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     magic = b"\x89MCAP0\r\n"
@@ -129,24 +133,6 @@ def test_the_shortest_finished_file_is_an_empty_recording_and_with_a_byte_less_i
     path.write_bytes((magic + footer + magic)[:-1])
     with pytest.raises(RecordingError, match="ends before its first message"):
         open_recording(path)
-
-
-def test_an_index_without_statistics_does_not_contradict_the_chunks(write: Write) -> None:
-    path = write(LINES, use_statistics=False, enable_crcs=False)
-    whole = path.read_bytes()
-    for part in (b"geometry_msgs/TransformStamped", b"/tf_static"):
-        data = bytearray(whole)
-        data[data.rindex(part)] ^= 1
-        path.write_bytes(data)
-        assert batches_in(path) == EXPECTED
-
-
-def test_a_message_at_log_time_zero_counts(write: Write) -> None:
-    for finish in (True, False):
-        path = write([(0, "/tf", [moving("a", "b", 0)])], finish=finish)
-        with open_recording(path) as recording:
-            assert (recording.start, recording.end) == (0, 0)
-        assert [message.received for message in messages_in(path)] == [0]
 
 
 @pytest.mark.parametrize("finish", [True, False])
@@ -162,28 +148,6 @@ def test_a_message_whose_log_time_is_no_stamp_is_reported_and_the_others_are_rea
     assert len(found) == 3 + finish
 
 
-def test_a_finished_file_without_messages_is_an_empty_recording(write: Write) -> None:
-    with open_recording(write([])) as recording:
-        assert facts(recording) == (None, None, 0, True)
-        assert list(recording.messages()) == []
-
-
-def test_messages_on_other_topics_or_of_other_types_are_ignored(write: Write) -> None:
-    other = [moving("x", "y", 0)]
-    lines = [
-        (5, "/camera", b"\xff" * 5_000),
-        *((6, topic, other) for topic in ("/robot1/tf", "/tf_old", "/tf/more", "//tf")),
-        (7, "tf", [moving("a", "b", 1)]),
-        (8, "tf_static", [static("b", "c")]),
-    ]
-    path = write(lines)
-    assert batches_in(path) == [(7, (moving("a", "b", 1),)), (8, (static("b", "c"),))]
-    with open_recording(path) as recording:
-        assert (recording.start, recording.count) == (5, 2)
-    assert batches_in(write(LINES, schema="sensor_msgs/msg/Image")) == []
-    assert batches_in(write(LINES, encoding="protobuf")) == []
-
-
 @given(
     times=st.lists(st.integers(0, 30), max_size=40),
     chunk_size=st.integers(1, 2_000),
@@ -195,11 +159,10 @@ def test_messages_are_ordered_by_log_time_wherever_they_are_in_the_file(
     lines = [(time, "/tf", [moving("a", "b", place)]) for place, time in enumerate(times)]
     path = write_mcap(tmp_path_factory.mktemp("recording") / "run.mcap", lines, chunk_size=chunk_size)
     by_time = sorted((time, place) for place, time in enumerate(times))
-    found = [(message.received, message.batch[0].stamp) for message in messages_in(path)]
-    assert found == by_time
-    since, until = ends
-    within = [(message.received, message.batch[0].stamp) for message in messages_in(path, since, until)]
-    assert within == [(time, place) for time, place in by_time if since <= time <= until]
+    for since, until in ((0, 30), ends):
+        expected = [(time, place) for time, place in by_time if since <= time <= until]
+        for messages in (messages_in(path, since, until), in_blocks(path, since, until)):
+            assert [(message.received, message.batch[0].stamp) for message in messages] == expected
 
 
 def test_only_the_chunks_of_the_range_are_read(write: Write) -> None:
@@ -251,29 +214,19 @@ def test_damage_before_a_range_is_reported_at_the_start_of_the_range(write: Writ
     assert all(since <= received <= 114 for since, received in lost.items() if since <= 114)
 
 
-@pytest.mark.parametrize(("enough", "count"), [(1, 5), (2**16, 1)])
+@pytest.mark.parametrize(("write_in", "count"), [(write_blocks, 5), (write_mcap, 1)])
 def test_each_message_of_a_part_comes_once_in_blocks_of_any_size(
-    write: Write, monkeypatch: pytest.MonkeyPatch, enough: int, count: int
+    tmp_path: Path, write_in: Callable[[Path, list[Line]], Path], count: int
 ) -> None:
-    monkeypatch.setattr(mcap, "_FIRST_BLOCK", enough)
     times = (0, 1, 2, 3, STAMP_MAX)
-    path = write([(time, "/tf", [moving("a", "b", place)]) for place, time in enumerate(times)], chunk_size=1)
+    path = write_in(tmp_path / "run.mcap", [(time, "/tf", [moving("a", "b", k)]) for k, time in enumerate(times)])
     for since in (None, *times):
         for until in (None, *times):
             first, last = 0 if since is None else since, STAMP_MAX if until is None else until
-            expected = [
-                (time, (moving("a", "b", place),), ()) for place, time in enumerate(times) if first <= time <= last
-            ]
+            expected = [(time, (moving("a", "b", k),), ()) for k, time in enumerate(times) if first <= time <= last]
             assert messages_in(path, since, until) == in_blocks(path, since, until) == expected
     with open_recording(path) as recording:
         assert len(list(recording.blocks())) == count
-
-
-def test_what_is_missing_is_told_behind_a_damaged_last_chunk(write: Write) -> None:
-    path = write([(time, "/tf", [moving("a", "b", time)]) for time in (5, 6, 7)], chunk_size=1)
-    damage(path, encode([moving("a", "b", 7)]))
-    for messages in (messages_in(path), in_blocks(path)):
-        assert [(message.received, len(message.errors)) for message in messages] == [(5, 0), (6, 0), (7, 1), (7, 1)]
 
 
 def test_a_chunk_without_transforms_is_not_read(write: Write) -> None:
@@ -309,21 +262,6 @@ def test_damage_in_the_index_loses_no_messages(write: Write) -> None:
             assert recording.count is None
 
 
-def test_an_index_entry_beyond_the_end_loses_only_its_chunk(write: Write) -> None:
-    path = write(LINES, enable_crcs=False)
-    data = bytearray(path.read_bytes())
-    place = next(place for place, opcode in records_in(data) if opcode == Opcode.CHUNK_INDEX)
-    # Behind the two log times.
-    data[place + 25 : place + 33] = b"\xff" * 8
-    path.write_bytes(data)
-    lost, *read = messages_in(path)
-    assert [error.reason for error in lost.errors] == ["damaged"]
-    promised = [read.pop() for _ in range(2)]
-    assert ["promises" in str(message.errors) for message in promised] == [True, True]
-    assert 0 < len(read) < len(EXPECTED)
-    assert [(message.received, message.batch) for message in read] == EXPECTED[-len(read) :]
-
-
 def test_an_index_entry_that_leads_to_another_record_loses_only_its_chunk(write: Write) -> None:
     path = write(LINES, enable_crcs=False)
     data = bytearray(path.read_bytes())
@@ -341,24 +279,6 @@ def test_an_index_entry_that_leads_to_another_record_loses_only_its_chunk(write:
         assert read == EXPECTED[-len(read) :]
 
 
-def test_an_index_with_a_channel_that_has_no_schema_is_used(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as file:
-        writer: Any = Writer(file)
-        writer.start("ros2", "tests")
-        kind = writer.register_schema("tf2_msgs/msg/TFMessage", "ros2msg", b"")
-        for topic, schema in (("/tf", kind), ("/log", 0)):
-            writer.add_message(writer.register_channel(topic, "cdr", schema), 5, encode([moving("a", "b", 5)]), 5)
-        writer.finish()
-    with open_recording(path) as recording:
-        assert [(topic.name, topic.type, topic.count) for topic in recording.topics] == [
-            ("/log", "", 1),
-            ("/tf", "tf2_msgs/msg/TFMessage", 1),
-        ]
-        assert recording.count == 1
-    assert batches_in(path) == [(5, (moving("a", "b", 5),))]
-
-
 def test_an_unreadable_record_is_reported_and_the_next_ones_are_read(write: Write) -> None:
     path = write(LINES, finish=False)
     data = path.read_bytes()
@@ -373,44 +293,12 @@ def test_an_unreadable_record_is_reported_and_the_next_ones_are_read(write: Writ
     assert lost.received == EXPECTED[-1][0]
 
 
-def test_a_record_of_an_unknown_kind_or_beyond_its_bound_is_told_with_its_place(
-    write: Write, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_record_of_an_unknown_kind_is_told_with_its_place(write: Write) -> None:
     path = write(LINES, finish=False)
     data = path.read_bytes()
     path.write_bytes(data + b"\x7f" + (3).to_bytes(8, "little") + b"abc" + data[8:])
     (lost,) = errors_in(messages_in(path))
     assert lost.endswith(f"the record at byte {len(data)}: its kind, 127, is unknown")
-    path = write(LINES[:1], finish=False)
-    chunk = next(place for place, opcode in records_in(path.read_bytes()) if opcode == Opcode.CHUNK)
-    path.write_bytes(path.read_bytes() + write(LINES[1:2], finish=False, use_chunking=False).read_bytes()[8:])
-    monkeypatch.setitem(mcap_records._BOUND, Opcode.CHUNK, 50)
-    (lost,) = errors_in(messages_in(path))
-    assert lost.endswith(f"the chunk at byte {chunk}: it exceeds its bound")
-
-
-@pytest.mark.parametrize(
-    "compression",
-    [
-        CompressionType.NONE,
-        *(pytest.param(kind, marks=pytest.mark.thorough) for kind in (CompressionType.LZ4, CompressionType.ZSTD)),
-    ],
-)
-def test_a_file_cut_at_any_byte_gives_the_messages_before_the_cut(write: Write, compression: CompressionType) -> None:
-    path = write(LINES[:10], compression=compression)
-    found, shortest = EXPECTED[:10], 10
-    for size in reversed(range(0, path.stat().st_size, 3)):
-        os.truncate(path, size)
-        try:
-            found = batches_in(path)
-        except RecordingError as error:
-            assert error.reason == ("truncated" if size else "empty")
-            found = []
-        assert found == EXPECTED[: len(found)]
-        # What can be read of a shorter file can be read of a longer one.
-        assert len(found) <= shortest
-        shortest = len(found)
-    assert found == []
 
 
 @given(data=st.data())
@@ -431,24 +319,6 @@ def test_changed_bytes_never_lead_to_other_samples_than_the_recorded_ones(
         return
     read = [(message.received, message.batch) for message in messages if message.batch]
     assert all(line in EXPECTED for line in read)
-
-
-def test_a_foreign_message_on_the_topic_is_counted_and_the_next_ones_are_read(write: Write) -> None:
-    path = write([(1, "/tf", b"\0\1\0\0nonsense"), (2, "/tf", b""), (3, "/tf", [moving("a", "b", 3)])])
-    first, second, third = messages_in(path)
-    assert [error.reason for error in first.errors] == ["truncated"]
-    assert [error.reason for error in second.errors] == ["truncated"]
-    assert third.batch == (moving("a", "b", 3),)
-
-
-def test_messages_of_ros_1_are_read_as_well_with_their_sender(write: Write) -> None:
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    sample = moving("odom", "base", 1_500_000_000, 2.5)
-    payload = bytes(types.cdr_to_ros1(encode([sample]), "tf2_msgs/msg/TFMessage"))
-    for schema in ("tf2_msgs/TFMessage", "tf/tfMessage"):
-        lines = [(1, "/tf", payload)]
-        path = write(lines, schema=schema, encoding="ros1", metadata={"callerid": "/odometry"})
-        assert batches_in(path) == [(1, (sample.replace(authority="odometry"),))]
 
 
 AUTHORITIES = "tfbus.authorities"
@@ -481,24 +351,6 @@ def test_authorities_are_in_the_metadata_of_the_channel(write: Write, metadata: 
     assert [sample.authority for sample in moving_ones] == authorities
     assert [sample.authority for sample in static_ones] == authorities
     assert all(sample.static for sample in static_ones)
-
-
-def test_the_official_reader_finds_the_same_messages(write: Write) -> None:
-    path = write(LINES)
-    with path.open("rb") as file:
-        official = [(message.log_time, message.data) for _, _, message in make_reader(file).iter_messages()]
-    ours: list[tuple[int, bytes]] = [(received, encode(batch)) for received, batch in batches_in(path)]
-    assert ours == official
-
-
-def test_several_iterations_are_independent(write: Write) -> None:
-    with open_recording(write(LINES)) as recording:
-        first, second = recording.messages(), recording.messages()
-        assert next(first) == next(second)
-        for _ in range(5):
-            next(first)
-        rest: list[tuple[int, tuple[TransformStamped, ...]]] = [(its.received, its.batch) for its in second]
-        assert rest == EXPECTED[1:]
 
 
 def test_a_description_that_contradicts_that_of_the_index_is_told_and_that_of_the_index_holds(write: Write) -> None:
@@ -595,37 +447,6 @@ def test_the_whole_part_of_a_torn_chunk_is_read(write: Write) -> None:
     assert 0 < counts[0] < counts[1] < counts[2] < 5_000
 
 
-@pytest.mark.parametrize(
-    ("part", "says"),
-    [
-        (b"/tf_static", "topic /tg_static"),
-        (b"tf2_msgs/msg/TFMessage", "of type tg2_msgs/msg/TFMessage"),
-    ],
-)
-def test_a_name_in_the_index_that_no_longer_is_one_of_transforms_is_mentioned(
-    write: Write, part: bytes, says: str
-) -> None:
-    path = write(LINES, enable_crcs=False)
-    data = bytearray(path.read_bytes())
-    place = data.rindex(part) + part.index(b"f")
-    data[place] ^= 1
-    path.write_bytes(data)
-    with open_recording(path) as recording:
-        assert any(says in remark for remark in recording.remarks)
-
-
-def test_an_index_that_no_longer_leads_to_a_chunk_with_transforms_is_told(write: Write) -> None:
-    path = write(LINES, enable_crcs=False)
-    data = bytearray(path.read_bytes())
-    entry = next(place for place, opcode in records_in(data) if opcode == Opcode.CHUNK_INDEX)
-    # The length of the chunk.
-    data[entry + 33 : entry + 41] = (2**40).to_bytes(8, "little")
-    path.write_bytes(data)
-    for errors in (errors_in(messages_in(path)), errors_in(in_blocks(path))):
-        assert any("it is behind the end of the file" in text for text in errors)
-        assert any("promises" in text for text in errors)
-
-
 @given(data=st.data())
 def test_one_flipped_bit_never_loses_a_message_in_silence(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
@@ -643,3 +464,249 @@ def test_one_flipped_bit_never_loses_a_message_in_silence(
         told = recording.remarks or not recording.finished
     read = sum(bool(message.batch) for message in messages)
     assert read == 15 or told or any(message.errors for message in messages)
+
+
+def message(number: int, received: int, payload: bytes) -> bytes:
+    content = struct.pack("<HIQQ", number, 0, received, 0) + payload
+    return struct.pack("<BQ", 5, len(content)) + content
+
+
+def raw_record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def text(content: str) -> bytes:
+    return struct.pack("<I", len(content)) + content.encode()
+
+
+def described(number: int, kind: str) -> bytes:
+    """The schema and the channel of a number, of a type."""
+    schema = struct.pack("<H", number + 1) + text(kind) + text("") + text("")
+    return raw_record(3, schema) + raw_record(
+        4, struct.pack("<HH", number, number + 1) + text("/tf") + text("cdr") + text("")
+    )
+
+
+STATISTICS = raw_record(11, struct.pack("<QHIIIIQQI", 0, 2, 2, 0, 0, 0, 0, 0, 0))
+FILE = (
+    MAGIC
+    + described(0, "a")
+    + described(3, "b")
+    + STATISTICS
+    + raw_record(2, struct.pack("<QQI", len(MAGIC), 0, 0))
+    + MAGIC
+)
+"""A finished file without messages, whose channels have the numbers 0 and 3."""
+
+
+def packed(*contents: bytes, low: int = 0, high: int = 100) -> tuple[list[tuple[int, str, bytes]], Counter[int]]:
+    """Log time, kind of channel or damage, and payload of the messages in some chunks; and the number of all."""
+    with closing(McapStorage(Path("run.mcap"), BytesIO(FILE))) as storage:
+        reading = McapReading(storage, lambda _: True)
+        chunks = [OpenChunk(ChunkPlace(5, 9, at), content) for at, content in enumerate(contents)]
+        found = []
+        for block in ChunkPacker(reading).pack(chunks, low, high):
+            damaged = not isinstance(block, Packed) and any(not isinstance(channel, Channel) for _, channel, _ in block)
+            assert isinstance(block, Packed) != damaged
+            for received, channel, payload in block.stored() if isinstance(block, Packed) else block:
+                found.append((received, channel.type if isinstance(channel, Channel) else channel.detail, payload))
+        return found, reading.counts
+
+
+def test_all_messages_are_counted_and_those_of_wanted_channels_are_packed_by_time() -> None:
+    first, second = message(3, 7, b"x") + message(8, 1, b""), message(0, 5, b"y") + message(3, 6, b"z")
+    expected = [(5, "a", b"y"), (6, "b", b"z"), (7, "b", b"x")]
+    assert packed(first, second) == (expected, {0: 1, 3: 2, 8: 1})
+    # Of a part, both ends belong to it, and all are counted.
+    assert packed(first, second, low=6, high=7) == (expected[1:], {0: 1, 3: 2, 8: 1})
+    assert packed(first, second, low=6, high=6) == (expected[1:2], {0: 1, 3: 2, 8: 1})
+    # Also if no channel is wanted, or nothing is there.
+    assert packed(message(8, 1, b"")) == ([], {8: 1})
+    assert packed() == packed(b"") == ([], {})
+
+
+@pytest.mark.parametrize(
+    ("damaged", "why"),
+    [
+        (message(3, 6, b"x")[:-1], "a record goes on behind the end of the chunk"),
+        (struct.pack("<BQ", 5, 21) + bytes(40), "a message is too short"),
+        (message(3, 6, b"x") * 3, "it has more than 2 messages, which is the bound"),
+    ],
+)
+def test_the_messages_of_the_good_chunks_are_counted_beside_a_damaged_one(
+    monkeypatch: pytest.MonkeyPatch, damaged: bytes, why: str
+) -> None:
+    for module in ("mcap", "mcap_records"):
+        monkeypatch.setattr(f"tfbus.recording.formats.{module}.MAX_CHUNK_MESSAGES", 2)
+    good = message(3, 7, b"x") + message(8, 1, b"")
+    lost = f"the chunk at byte 1: {why}"
+    assert packed(good, damaged, good) == ([(5, lost, b""), *[(7, "b", b"x")] * 2], {3: 2, 8: 2})
+    assert packed(damaged, low=6) == ([(6, lost.replace("1", "0", 1), b"")], {})
+    # Where nothing is damaged, so many are packed.
+    assert packed(good, good) == ([(7, "b", b"x")] * 2, {3: 2, 8: 2})
+
+
+TF = Channel("/tf", "", "cdr")
+
+
+def split(data: bytes, torn: bool = False) -> tuple[list[tuple[int, object, bytes]], dict[int, int]]:
+    registered: list[McapRecord] = []
+    found, counts = split_chunk(data, {3: TF}.get, registered.append, torn)
+    assert registered == []
+    return list(found), counts
+
+
+def test_messages_of_wanted_channels_are_found_and_all_are_counted() -> None:
+    data = message(3, 10, b"x") + message(4, 11, b"y") + message(3, 12, b"")
+    assert split(data) == ([(10, TF, b"x"), (12, TF, b"")], {3: 2, 4: 1})
+
+
+def test_a_record_that_goes_on_behind_the_end_is_damage_unless_the_chunk_is_torn() -> None:
+    data = message(3, 10, b"x") + message(3, 11, b"y")
+    for size in range(len(data) // 2 + 1, len(data)):
+        with pytest.raises((ValueError, struct.error)):
+            split(data[:size])
+        assert split(data[:size], torn=True) == ([(10, TF, b"x")], {3: 1})
+
+
+def record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def test_records_are_read_up_to_their_bounds_and_private_ones_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_records, "MAX_INDEX", 3)
+    for opcode in (Opcode.SCHEMA, Opcode.STATISTICS):
+        kinds = ((opcode, 3), (128, 1), (opcode, 4), (255, 1), (opcode, 0), (2, 0))
+        data = b"".join(record(kind, bytes(size)) for kind, size in kinds)
+        found = [(0, opcode, bytes(3)), (22, opcode, None), (45, opcode, b"")]
+        assert list(read_records(BytesIO(data), len(data))) == found
+
+
+def test_the_part_of_a_record_that_there_is_comes_with_the_end_of_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = record(Opcode.MESSAGE, b"abc")
+    for size, torn in ((12, None), (11, (Opcode.MESSAGE, b"ab")), (9, (Opcode.MESSAGE, b"")), (8, None), (0, None)):
+        found = read_records(BytesIO(data[:size]), size)
+        if size == 12:
+            assert next(found) == (0, Opcode.MESSAGE, b"abc")
+        with pytest.raises(EndOfFile) as raised:
+            next(found)
+        end = () if torn is None else (torn,)
+        assert raised.value.args == end
+        # What a writer has put behind it meanwhile is not read.
+        if size < 12:
+            found = read_records(BytesIO(data + data + bytes(5)), 12 + size)
+            assert next(found) == (0, Opcode.MESSAGE, b"abc")
+            with pytest.raises(EndOfFile) as raised:
+                next(found)
+            assert raised.value.args == end
+    # Of a huge one, no more than of a chunk.
+    monkeypatch.setattr(mcap_records, "MAX_CHUNK", 2)
+    with pytest.raises(EndOfFile) as raised:
+        next(read_records(BytesIO(record(Opcode.MESSAGE, bytes(9))[:-1]), 17))
+    assert raised.value.args == ((Opcode.MESSAGE, bytes(2)),)
+
+
+def test_an_entry_of_the_index_is_parsed_as_by_the_official_reader() -> None:
+    offsets = struct.pack("<HQHQ", 3, 100, 7, 200)
+    content = struct.pack("<QQQQI", 1, 2, 3, 4, len(offsets)) + offsets
+    content += struct.pack("<QI", 5, 4) + b"zstd" + struct.pack("<QQ", 6, 7)
+    found = parse_record(Opcode.CHUNK_INDEX, content)
+    assert found == ChunkIndex.read(ReadDataStream(BytesIO(content)))
+    assert found == ChunkIndex(
+        message_start_time=1,
+        message_end_time=2,
+        chunk_start_offset=3,
+        chunk_length=4,
+        message_index_offsets={3: 100, 7: 200},
+        message_index_length=5,
+        compression="zstd",
+        compressed_size=6,
+        uncompressed_size=7,
+    )
+    for size in range(len(content)):
+        with pytest.raises(DAMAGE):
+            parse_record(Opcode.CHUNK_INDEX, content[:size])
+    assert parse_record(Opcode.METADATA, b"") is None
+
+
+def test_a_channel_is_asked_for_again_behind_a_record_that_may_describe_it() -> None:
+    described = struct.pack("<HHI", 3, 0, 3) + b"/tf" + struct.pack("<II", 0, 0)
+    channels: dict[int, Channel] = {}
+
+    def register(found: McapRecord) -> None:
+        assert (getattr(found, "id", None), getattr(found, "topic", None)) == (3, "/tf")
+        channels[3] = TF
+
+    data = message(3, 10, b"x") + record(Opcode.CHANNEL, described) + message(3, 11, b"y")
+    assert split_chunk(data, channels.get, register) == ([(11, TF, b"y")], {3: 2})
+
+
+def test_a_chunk_holds_wanted_messages_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_records, "MAX_CHUNK_MESSAGES", 2)
+    data = message(3, 10, b"x") + message(4, 11, b"y") + message(3, 12, b"z")
+    assert split(data) == ([(10, TF, b"x"), (12, TF, b"z")], {3: 2, 4: 1})
+    with pytest.raises(ValueError, match="it has more than 2 messages, which is the bound"):
+        split(data + message(3, 13, b""))
+
+
+def chunk(data: bytes, size: int, crc: int = 0, compression: bytes = b"") -> bytes:
+    head = struct.pack("<QQQII", 1, 2, size, crc, len(compression)) + compression
+    return head + struct.pack("<Q", len(data)) + data
+
+
+def test_a_chunk_has_the_size_and_the_checksum_that_it_claims() -> None:
+    assert Chunk.parse(chunk(b"abc", 3)).unfold() == b"abc"
+    for wrong, why in (
+        (chunk(b"abc", 4), "claims 4 bytes, and holds 3"),
+        (chunk(b"abc", 2), "more than 2 bytes"),
+        (chunk(b"abc", 3, crc=1), "checksum"),
+        (chunk(b"abc", 2**40), "is the bound"),
+        (chunk(b"abc", 3, compression=b"rar"), "'rar' is unknown"),
+    ):
+        with pytest.raises(UnfoldError, match=why):
+            Chunk.parse(wrong).unfold()
+    with pytest.raises(ValueError, match="3 bytes are announced, and there are 2"):
+        Chunk.parse(chunk(b"abc", 3)[:-1])
+    assert Chunk.parse(chunk(b"abc", 3)[:-1], torn=True).unfold(torn=True) == b"ab"
+    with pytest.raises(ValueError, match="name of the compression has 33 bytes"):
+        Chunk.parse(chunk(b"", 0, compression=b"x" * 33))
+    assert Chunk.parse(chunk(b"", 0, compression=b"x" * 32)).compression == "x" * 32
+    assert Chunk.parse(chunk(b"abc", 3, 4, b"lz4")) == (1, 2, 3, 4, "lz4", b"abc")
+    # The checksum is that of the whole content.
+    assert Chunk.parse(chunk(b"abc", 3, crc=zlib.crc32(b"abc"))).unfold() == b"abc"
+    assert Chunk.parse(chunk(b"abc", 3, crc=1)[:-1], torn=True).unfold(torn=True) == b"ab"
+
+
+def written(sizes: list[int]) -> bytes:
+    # Contents that look like heads must not be taken for them.
+    return b"".join(struct.pack("<BQ", 5, size) + bytes(size) for size in sizes)
+
+
+@given(
+    st.lists(st.tuples(st.lists(st.integers(0, 5), min_size=1, max_size=5), st.integers(1, 90)), min_size=1, max_size=4)
+)
+@example([([1, 2, 3], 90), ([4], 1), ([1, 2, 3], 90)])
+def test_all_records_are_found_whether_their_lengths_repeat_or_not(parts: list[tuple[list[int], int]]) -> None:
+    sizes = [size for lengths, count in parts for size in islice(cycle(lengths), count)]
+    assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
+
+
+def test_all_records_are_found_wherever_their_lengths_change() -> None:
+    for count in range(70):
+        sizes = [3] * count + [4, 4, 5, 4, 4, 5] + [3, 1] * 20
+        assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
+
+
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_a_last_record_that_is_cut_off_is_damage(count: int) -> None:
+    data = written([3] * count)
+    for missing in range(1, 12):
+        with pytest.raises((ValueError, struct.error)):
+            record_places(data[:-missing])
+
+
+@pytest.mark.parametrize("size", [2**63, 2**64 - 1, 100])
+def test_a_record_that_claims_more_than_there_is_is_damage(size: int) -> None:
+    for count in (0, 40):
+        with pytest.raises(ValueError, match="behind the end"):
+            record_places(written([3] * count) + struct.pack("<BQ", 5, size) + bytes(90))

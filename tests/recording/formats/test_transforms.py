@@ -1,30 +1,193 @@
+"""Messages of transforms in every encoding, decoded one by one and at once."""
+
+import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from support.samples import moving, static
 
 from tfbus import TransformStamped
+from tfbus.recording.formats import transforms
 from tfbus.recording.formats.storage import Channel, Packed, StoredMessage, pack
 from tfbus.recording.formats.transforms import (
     ChannelDecoder,
     ColumnDecoder,
     Columns,
     RawTransform,
+    bounded,
+    parser_of,
     write_cdr,
     write_ros1,
 )
-from tfbus.tf_message import MAX_NAME, encode
+from tfbus.tf_message import MalformedMessageError, encode
+
+NUMBERS = struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1)
+ONE = RawTransform(5, 6, b"map", b"base", NUMBERS)
+TWO = RawTransform(7, 8, b"base", b"camera1", struct.pack("<7d", 4, 5, 6, 0, 0, 1, 0))
+METADATA = {"tfbus.authorities": '[["odometry", 1], ["slam", 1]]'}
+CDR = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr", metadata=METADATA)
+ROS1 = Channel("/tf", "tf2_msgs/TFMessage", "ros1", metadata={"callerid": "/odometry"})
+AS_JSON = {
+    "timestamp": {"sec": 5, "nsec": 6},
+    "parent_frame_id": "map",
+    "child_frame_id": "base",
+    "translation": {"x": 1, "y": 2.0, "z": 3},
+    "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
+}
+
+
+def foxglove(encoding: str, name: str = "foxglove.FrameTransforms", schema: bytes = b"") -> Channel:
+    return Channel("/tf", name, encoding, encoding, schema)
+
+
+def test_json_of_one_transform_and_of_many_is_read() -> None:
+    assert parser_of(foxglove("json"))(json.dumps({"transforms": [AS_JSON, AS_JSON]}).encode()) == [ONE, ONE]
+    assert parser_of(foxglove("json", "foxglove.FrameTransform"))(json.dumps(AS_JSON).encode()) == [ONE]
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"[", b"[" * 100_000, b"3", b'{"transforms": 3}', b'{"transforms": [{}]}', b"\xff", b"null"]
+)
+def test_other_json_is_malformed(text: bytes) -> None:
+    with pytest.raises(MalformedMessageError):
+        parser_of(foxglove("json"))(text)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"), [(("timestamp", "sec"), 1.5), (("translation", "x"), "1"), (("rotation",), 3)]
+)
+def test_json_with_wrong_values_is_malformed(path: tuple[str, ...], value: object) -> None:
+    content = json.loads(json.dumps(AS_JSON))
+    inner = content
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    with pytest.raises(MalformedMessageError):
+        parser_of(foxglove("json", "foxglove.FrameTransform"))(json.dumps(content).encode())
+
+
+def test_foxglove_messages_of_ros_have_the_layout_of_ros() -> None:
+    many = foxglove("cdr", "foxglove_msgs/msg/FrameTransforms")
+    assert parser_of(many)(write_cdr([ONE])) == [ONE]
+    # A single one begins at the stamp, so its numbers are aligned otherwise.
+    names = b"\4\0\0\0map\0" + b"\5\0\0\0base\0"
+    single = b"\0\1\0\0" + struct.pack("<iI", 5, 6) + names
+    single += bytes(-(len(single) - 4) % 8) + NUMBERS
+    assert parser_of(foxglove("cdr", "foxglove_msgs/msg/FrameTransform"))(single) == [ONE]
+    assert parser_of(many)(write_cdr([ONE]) + bytes(3)) == [ONE]
+    with pytest.raises(MalformedMessageError, match=r": 4 bytes behind the last transform"):
+        parser_of(many)(write_cdr([ONE]) + bytes(4))
+    ros1 = struct.pack("<II", 5, 6) + b"\3\0\0\0map\4\0\0\0base" + NUMBERS
+    assert parser_of(foxglove("ros1", "foxglove_msgs/FrameTransform"))(ros1) == [ONE]
+
+
+def test_cdr_is_read_in_either_byte_order_and_in_the_usual_one_bit_for_bit() -> None:
+    swapped = struct.pack(">IiI", 1, 5, 6) + b"\0\0\0\4map\0" + b"\0\0\0\5base\0\0\0\0"
+    swapped += bytes(-len(swapped) % 8) + struct.pack(">7d", 1, 2, 3, 0, 0, 0, 1)
+    assert parser_of(CDR)(b"\0\0\0\0" + swapped) == [ONE]
+    # A signalling NaN.
+    odd = RawTransform(*ONE[:4], bytes.fromhex("010000000000f07f") + NUMBERS[8:])
+    assert parser_of(CDR)(write_cdr([odd])) == [odd]
+
+
+@pytest.mark.parametrize(("channel", "payload"), [(CDR, write_cdr([ONE, TWO])), (ROS1, write_ros1([ONE, TWO]))])
+def test_a_message_that_is_cut_anywhere_is_malformed(channel: Channel, payload: bytes) -> None:
+    reasons = set()
+    for size in range(len(payload)):
+        with pytest.raises(MalformedMessageError) as raised:
+            parser_of(channel)(payload[:size])
+        reasons.add(raised.value.reason)
+    # Of CDR, the header may be cut, or a string may be without its NUL.
+    assert reasons == ({"truncated"} if channel is ROS1 else {"truncated", "encoding", "text"})
+
+
+@pytest.mark.parametrize(
+    ("write", "channel", "low", "high"), [(write_cdr, CDR, -(2**31), 2**31), (write_ros1, ROS1, 0, 2**32)]
+)
+def test_the_seconds_that_the_stamp_of_an_encoding_holds_are_written(
+    write: Callable[[list[RawTransform]], bytes], channel: Channel, low: int, high: int
+) -> None:
+    for seconds in (low, high - 1):
+        edge = RawTransform(seconds, *ONE[1:])
+        assert parser_of(channel)(write([edge])) == [edge]
+    for seconds in (low - 1, high):
+        with pytest.raises(MalformedMessageError, match=f"{seconds} s does not fit the stamp") as raised:
+            write([RawTransform(seconds, *ONE[1:])])
+        assert raised.value.reason == "stamp"
+
+
+def test_protobuf_is_read_by_the_schema_in_the_file() -> None:
+    foxglove_sdk = pytest.importorskip("foxglove.messages")
+    one = foxglove_sdk.FrameTransform(
+        timestamp=foxglove_sdk.Timestamp(5, 6),
+        parent_frame_id="map",
+        child_frame_id="base",
+        translation=foxglove_sdk.Vector3(x=1.0, y=2.0, z=3.0),
+        rotation=foxglove_sdk.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    payload, schema = foxglove_sdk.FrameTransforms(transforms=[one]).encode(), foxglove_sdk.FrameTransforms.get_schema()
+    assert parser_of(foxglove("protobuf", schema=schema.data))(payload) == [ONE]
+    for wrong in (foxglove("protobuf"), foxglove("protobuf", schema=b"\xff" * 9)):
+        with pytest.raises(MalformedMessageError):
+            parser_of(wrong)(payload)
+    with pytest.raises(MalformedMessageError):
+        parser_of(foxglove("protobuf", schema=schema.data))(b"\xff" * 20)
+
+
+def test_of_a_long_text_the_error_shows_the_beginning() -> None:
+    body = struct.pack("<I", 1) + bytes(8) + struct.pack("<I", 50) + b"x" * 50 + bytes(80)
+    with pytest.raises(MalformedMessageError, match=f"the string b'{'x' * 40}' does not end with NUL"):
+        parser_of(CDR)(b"\0\1\0\0" + body)
+    with pytest.raises(MalformedMessageError) as raised:
+        parser_of(foxglove("json"))(b"\xff" * 300)
+    assert len(raised.value.detail) == 200
+
+
+def test_a_message_is_bounded_compressed_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transforms, "MAX_MESSAGE", 300)
+    compress = zstandard.compress
+    assert bounded(bytes(300)) == bounded(compress(bytes(300))) == bytes(300)
+    for payload, reason in (
+        (bytes(301), "oversized"),
+        (compress(bytes(301)), "oversized"),
+        (compress(b"")[:4] + b"\xff" * 30, "encoding"),
+    ):
+        with pytest.raises(MalformedMessageError) as raised:
+            bounded(payload)
+        assert raised.value.reason == reason
+
+
+BY_ODOMETRY = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr", metadata={"tfbus.authorities": '[["odometry", 1]]'})
+SAMPLES = [moving("odom", "base", 3, 1.5, "odometry"), moving("base", "wheel", 4, 2.5, "odometry")]
+PAYLOAD = encode(SAMPLES)
+BY_ROS_1 = bytes(get_typestore(Stores.ROS2_HUMBLE).cdr_to_ros1(PAYLOAD, "tf2_msgs/msg/TFMessage"))
+
+
+def test_a_refused_transform_stays_refused_under_a_prefix() -> None:
+    payload = encode([moving("map", "a", 1), moving("map", "b", 1, 12_345.0)])
+    payload = payload.replace(struct.pack("<d", 12_345.0), struct.pack("<d", float("nan")))
+    found = ChannelDecoder(BY_ODOMETRY, static=False, prefix="r/").decode(payload)
+    assert found.samples == [moving("r/map", "r/a", 1, authority="odometry"), None]
+    assert [error.reason for error in found.errors] == ["not finite"]
+
+
+@pytest.mark.parametrize("channel", [BY_ODOMETRY, ROS1])
+@given(payload=st.binary(max_size=300))
+def test_any_bytes_are_samples_or_malformed(channel: Channel, payload: bytes) -> None:
+    try:
+        ChannelDecoder(channel, static=False).decode(payload)
+    except MalformedMessageError as error:
+        assert error.reason
+
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 TF = "tf2_msgs/msg/TFMessage"
-METADATA = {"tfbus.authorities": '[["odometry", 1], ["slam", 1]]'}
-CDR = Channel("/tf", TF, "cdr", metadata=METADATA)
-ROS1 = Channel("/tf", "tf2_msgs/TFMessage", "ros1", metadata={"callerid": "/odometry"})
 OTHER = Channel("/tf", TF, "cdr", metadata={"tfbus.authorities": '[["other", 1]]'})
 
 
@@ -53,13 +216,19 @@ def packed(stored: Sequence[StoredMessage]) -> Packed:
     return found
 
 
-def samples_in(columns: Columns) -> list[TransformStamped]:
-    found = []
-    for stamp, row in zip(columns.stamps.tolist(), columns.rows.tolist(), strict=True):
-        sample = TransformStamped.__new__(TransformStamped)
-        sample._fields = columns.parent, columns.child, stamp, tuple(row), columns.authority, columns.static
-        found.append(sample)
-    return found
+Fields = tuple[str, str, int, tuple[float, ...], str, bool]
+
+
+def fields_of(sample: TransformStamped) -> Fields:
+    row = (*sample.transform.translation, *sample.transform.rotation)
+    return sample.parent, sample.child, sample.stamp, row, sample.authority, sample.static
+
+
+def fields_in(columns: Columns) -> list[Fields]:
+    return [
+        (columns.parent, columns.child, stamp, tuple(row), columns.authority, columns.static)
+        for stamp, row in zip(columns.stamps.tolist(), columns.rows.tolist(), strict=True)
+    ]
 
 
 numbers = st.floats(-1e8, 1e8, allow_nan=False)
@@ -106,12 +275,12 @@ def test_the_bits_are_those_of_decoding_one_by_one(
         # A frame has several parents.
         assert any(len({sample.parent for sample in samples}) > 1 for samples in one_by_one.values())
         return
-    found = [sample for each in columns for sample in samples_in(each)]
+    found = {(each.child, each.authority): fields_in(each) for each in columns}
     for child, samples in one_by_one.items():
         for authority in {sample.authority for sample in samples}:
-            its = [sample for sample in samples if sample.authority == authority]
-            assert [each for each in found if (each.child, each.authority) == (child, authority)] == its
-    assert len(found) == sum(map(len, one_by_one.values()))
+            its = [fields_of(sample) for sample in samples if sample.authority == authority]
+            assert found[child, authority] == its
+    assert sum(map(len, found.values())) == sum(map(len, one_by_one.values()))
     for each in columns:
         assert each.received.tolist() == [stored[at][0] for at in each.order.tolist()]
         assert each.order.tolist() == sorted(each.order.tolist())
@@ -168,7 +337,7 @@ def test_a_message_with_a_wrong_bit_is_left_to_the_slow_path_or_decoded_to_the_s
         found = decoders[channel].decode(bytes(damaged))
         assert found.errors == []
         whole = decoders[channel].decode(payload).samples + found.samples
-        assert sorted((s for each in columns for s in samples_in(each)), key=str) == sorted(whole, key=str)
+        assert sorted(s for each in columns for s in fields_in(each)) == sorted(map(fields_of, filter(None, whole)))
 
 
 def test_leading_slashes_and_static_flags_are_those_of_the_channel() -> None:
@@ -178,17 +347,7 @@ def test_leading_slashes_and_static_flags_are_those_of_the_channel() -> None:
     assert columns is not None
     (found,) = columns
     assert found[:4] == ("map", "base", "", True)
-    assert samples_in(found) == [static("map", "base", stamp=5)]
-
-
-def test_samples_of_several_authorities_are_told_apart() -> None:
-    columns, _ = both([GOOD, (2, OTHER, encode([moving("map", "odom", 2)]))])
-    assert columns is not None
-    assert {(each.child, each.authority): each.stamps.tolist() for each in columns} == {
-        ("odom", "odometry"): [1],
-        ("base", "slam"): [1],
-        ("odom", "other"): [2],
-    }
+    assert fields_in(found) == [fields_of(static("map", "base", stamp=5))]
 
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -238,45 +397,11 @@ def test_a_quaternion_is_normalised_at_once_if_its_norm_is_off_by_no_more_than_a
         assert columns[0].rows.tolist() == [[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, -1.0]]
 
 
-@pytest.mark.parametrize("channel", [CDR, ROS1])
-def test_names_are_decoded_at_once_up_to_the_longest(channel: Channel) -> None:
-    for size, valid in ((MAX_NAME - 1, True), (MAX_NAME + 1, False)):
-        data = stamped(channel, 0, 1, child=b"n" * size)
-        decoders = {channel: ChannelDecoder(channel, static=False)}
-        assert (ColumnDecoder(decoders).decode(packed([(1, channel, data)])) is not None) == valid
-
-
-def test_messages_are_decoded_at_once_up_to_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tfbus.recording.formats.transforms.MAX_MESSAGE", len(GOOD[2]))
-    assert both([GOOD])[0] is not None
-    monkeypatch.setattr("tfbus.recording.formats.transforms.MAX_MESSAGE", len(GOOD[2]) - 1)
-    assert ColumnDecoder({CDR: ChannelDecoder(CDR, static=False)}).decode(packed([GOOD])) is None
-
-
 @pytest.mark.parametrize("names", [[f"f{k:03}" for k in range(200)], ["f" * k for k in range(1, 64)]])
 def test_many_frames_that_take_turns_are_decoded_at_once(names: list[str]) -> None:
     stored: list[StoredMessage] = [(k, CDR, encode([moving("map", name, k)])) for k, name in enumerate(2 * names)]
     columns, one_by_one = both(stored)
     assert columns is not None
-    assert {each.child: samples_in(each) for each in columns} == one_by_one
-
-
-def test_a_channel_with_more_layouts_than_are_kept_is_left_to_the_slow_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    stored: list[StoredMessage] = [(k, CDR, encode([moving("map", f"f{k}", k)])) for k in range(4)]
-    monkeypatch.setattr("tfbus.recording.formats.transforms._MAX_LAYOUTS", 3)
-    assert both(stored[:3])[0] is not None
-    assert both(stored)[0] is None
-
-
-def test_messages_of_one_size_with_more_structures_than_are_kept_are_left_to_the_slow_path(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    # The longer one name is, the shorter is the other.
-    stored: list[StoredMessage] = [
-        (k, CDR, encode([moving("map", "a" * (8 * k + 3), k), moving("map", "b" * (8 * (4 - k) + 3), k)]))
-        for k in range(4)
-    ]
-    assert len({len(payload) for _, _, payload in stored}) == 1
-    monkeypatch.setattr("tfbus.recording.formats.transforms._MAX_STRUCTURES", 3)
-    assert both(stored[:3])[0] is not None
-    assert both(stored)[0] is None
+    assert {each.child: fields_in(each) for each in columns} == {
+        child: [fields_of(sample) for sample in samples] for child, samples in one_by_one.items()
+    }

@@ -1,4 +1,5 @@
-import os
+"""Folders of ROS 2: several files, compression, and what the metadata promise."""
+
 import shutil
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,10 @@ import zstandard
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in, without_unfinished, write_mcap
-from support.samples import moving, static
+from support.samples import moving
 
 from tfbus import RecordingError
 from tfbus.recording import RecordedMessage, open_recording
-from tfbus.recording.formats.folder import _nameless_file
 
 ZSTD = {"fmt": CompressionFormat.ZSTD}
 LINES = [(time, "/tf", [moving("odom", "base", time)]) for time in range(30)]
@@ -60,30 +60,6 @@ def test_several_files_are_one_recording_in_the_order_of_their_times(tmp_path: P
         assert facts(recording) == (0, 29, 30, True)
     assert [message.received for message in in_blocks(tmp_path)] == list(range(30))
     assert [message.received for message in messages_in(tmp_path, 9, 11)] == [9, 10, 11]
-
-
-def test_files_that_overlap_are_merged(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "even.mcap", LINES[::2])
-    write_mcap(tmp_path / "odd.mcap", LINES[1::2])
-    assert batches_in(tmp_path) == EXPECTED
-
-
-def test_what_is_static_in_an_earlier_file_comes_first(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "run_0.mcap", [(0, "/tf_static", [static("base", "laser")])])
-    write_mcap(tmp_path / "run_1.mcap", LINES[10:])
-    first = messages_in(tmp_path, since=20)[0]
-    assert (first.received, first.batch) == (20, (static("base", "laser"),))
-
-
-def test_an_unfinished_file_makes_an_unfinished_recording(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES[:10])
-    write_mcap(tmp_path / "run_1.mcap", LINES[10:], finish=False)
-    assert batches_in(tmp_path) == EXPECTED
-    with open_recording(tmp_path) as recording:
-        assert facts(recording) == (0, 29, None, False)
-        assert {topic.count for topic in recording.topics} == {None}
-        assert len(without_unfinished(recording.messages())) == 30
-        assert sum(topic.count or 0 for topic in recording.topics) == 30
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"nonsense"])
@@ -191,15 +167,6 @@ def test_what_the_metadata_promise_of_topics_that_are_not_read_is_not_told(tmp_p
     assert batches_in(tmp_path) == EXPECTED
 
 
-def test_what_is_missing_of_several_files_is_told_behind_their_last_message(tmp_path: Path) -> None:
-    for part in range(2):
-        write_mcap(tmp_path / f"run_{part}.mcap", LINES[15 * part : 15 * part + 15])
-    metadata(tmp_path, "run_0.mcap", "run_1.mcap", count=31)
-    *_, last, lost = messages_in(tmp_path)
-    assert (last.received, lost.received) == (29, 29)
-    assert "promises 31 messages on '/tf', and 30 were found" in str(lost.errors[0])
-
-
 @pytest.mark.parametrize(
     ("text", "why"),
     [
@@ -234,35 +201,10 @@ def test_metadata_are_read_up_to_a_bound(tmp_path: Path, monkeypatch: pytest.Mon
             assert recording.remarks == (remark,)
 
 
-def test_an_error_without_words_is_told_by_its_name_and_a_long_one_is_cut(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    metadata(tmp_path, "run_0.mcap", count=30)
-    for error, told in ((MemoryError(), "MemoryError"), (ValueError("one\n two " + "x" * 300), "one two " + "x" * 192)):
-
-        def fail(_: bytes, error: Exception = error) -> None:
-            raise error
-
-        monkeypatch.setattr("tfbus.recording.formats.folder._as_yaml", fail)
-        with open_recording(tmp_path) as recording:
-            assert recording.remarks == (f"metadata.yaml is ignored, as it cannot be read: {told}",)
-
-
 def test_metadata_that_promise_nothing_on_a_topic_that_no_file_has_are_kept(tmp_path: Path) -> None:
     write_mcap(tmp_path / "run_0.mcap", LINES)
     metadata(tmp_path, "run_0.mcap", topic="/gone", count=0)
     assert batches_in(tmp_path) == EXPECTED
-
-
-def test_a_compressed_file_that_is_smaller_than_a_buffer_is_read(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "run_0.mcap", LINES[:3])
-    assert path.stat().st_size < 8_192
-    (tmp_path / "run_0.mcap.zstd").write_bytes(zstandard.compress(path.read_bytes()))
-    path.unlink()
-    assert batches_in(tmp_path) == EXPECTED[:3]
-    with open_recording(tmp_path) as recording:
-        assert recording.finished
 
 
 def test_without_metadata_an_uncompressed_file_hides_the_compressed_one(tmp_path: Path) -> None:
@@ -290,11 +232,6 @@ def test_a_compressed_file_unfolds_up_to_a_bound_and_nothing_of_it_stays(
         # What reads it has it open, and it has no name.
         assert list(temporary.iterdir()) == []
         assert sum(bool(message.batch) for message in recording.messages()) > 700
-
-
-def test_what_is_unpacked_is_for_nobody_else() -> None:
-    with _nameless_file() as file:
-        assert os.fstat(file.fileno()).st_mode & 0o077 == 0
 
 
 @pytest.mark.parametrize("received", [0, 7])

@@ -1,3 +1,5 @@
+"""Files of SQLite, as ROS 2 records them, whole and harmed."""
+
 import shutil
 import sqlite3
 import struct
@@ -10,14 +12,13 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rosbags.rosbag2 import StoragePlugin
 from support.processes import is_open
-from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in
+from support.recorded import batches_in, facts, messages_in
 from support.samples import moving, static
 
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import load, open_recording
-from tfbus.recording.formats.folder import _BLOCK, SqliteStorage
+from tfbus.recording.formats.folder import SqliteStorage
 from tfbus.recording.formats.storage import MAX_OTHER_MESSAGE
 from tfbus.recording.recording import Problems
 from tfbus.tf_message import encode
@@ -30,6 +31,11 @@ LINES: list[tuple[int, str, list[TransformStamped]]] = [
     (20, "/tf", [moving("odom", "base", 1)]),
 ]
 IN_ORDER = [(received, tuple(samples)) for received, _, samples in sorted(LINES, key=lambda line: line[0])]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.db3"
 
 
 def write(path: Path, *, oldest_schema: bool = False) -> sqlite3.Connection:
@@ -63,25 +69,18 @@ def add(file: sqlite3.Connection, topic: int, received: int, data: object) -> No
 
 
 @pytest.mark.parametrize("oldest_schema", [True, False])
-def test_messages_come_by_log_time_from_old_files_and_new_ones(tmp_path: Path, oldest_schema: bool) -> None:
-    path = tmp_path / "run.db3"
+def test_messages_come_by_log_time_from_old_files_and_new_ones(path: Path, oldest_schema: bool) -> None:
     write(path, oldest_schema=oldest_schema).close()
     assert batches_in(path) == IN_ORDER
     with open_recording(path) as recording:
         assert facts(recording) == (5, 40, 4, True)
 
 
-def test_a_range_includes_both_ends_and_begins_with_what_was_static(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
+def test_a_range_includes_both_ends_and_begins_with_what_was_static(path: Path) -> None:
     write(path).close()
     assert [message.received for message in messages_in(path, 20, 20)] == [20, 20, 20]
     assert messages_in(path, 25)[0].batch == (static("base", "laser", 1.0),)
     assert [message.received for message in messages_in(path, until=10)] == [10]
-
-
-def test_what_rosbags_writes_is_read(tmp_path: Path) -> None:
-    (path,) = as_ros2(SMALL, tmp_path / "bag", StoragePlugin.SQLITE3).glob("*.db3")
-    assert len(messages_in(path)) == len(messages_in(SMALL))
 
 
 def test_what_a_killed_writer_has_left_in_its_log_is_read(tmp_path: Path) -> None:
@@ -99,17 +98,7 @@ def test_what_a_killed_writer_has_left_in_its_log_is_read(tmp_path: Path) -> Non
         assert not recording.finished
 
 
-def test_an_empty_log_is_that_of_a_finished_file(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
-    write(path).close()
-    Path(f"{path}-wal").touch()
-    with open_recording(path) as recording:
-        assert recording.finished
-    assert batches_in(path) == IN_ORDER
-
-
-def test_all_topics_are_told_with_their_definitions_and_the_number_of_their_messages(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
+def test_all_topics_are_told_with_their_definitions_and_the_number_of_their_messages(path: Path) -> None:
     with write(path) as file:
         file.execute("INSERT INTO topics VALUES (5, '/silent', 'a/msg/B', 'cdr', '- history: 1')")
         file.execute("CREATE TABLE message_definitions(topic_type, encoding, encoded_message_definition)")
@@ -123,18 +112,13 @@ def test_all_topics_are_told_with_their_definitions_and_the_number_of_their_mess
             ("/tf", TF, 3),
             ("/tf_static", TF, 1),
         ]
-    storage = SqliteStorage(path)
-    with closing(storage):
-        found = {channel.topic: channel for channel in storage.channels}
-        assert list(storage.messages(lambda channel: channel.topic == "/silent")) == []
-    silent, camera = found["/silent"], found["/camera"]
+    with closing(SqliteStorage(path)) as storage:
+        (silent,) = (channel for channel in storage.channels if channel.topic == "/silent")
     assert (silent.schema_encoding, silent.schema) == ("ros2msg", b"int8 x")
     assert silent.metadata == {"offered_qos_profiles": "- history: 1"}
-    assert (camera.schema_encoding, camera.schema, camera.metadata) == ("", b"", {})
 
 
-def test_messages_on_topics_that_are_not_described_are_counted(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
+def test_messages_on_topics_that_are_not_described_are_counted(path: Path) -> None:
     with write(path) as file:
         for number in (98, 99, 99):
             add(file, number, 60, b"")
@@ -154,16 +138,7 @@ def test_messages_on_topics_that_are_not_described_are_counted(tmp_path: Path) -
         assert (lost.received, len(lost.errors)) == (received, 1)
 
 
-def test_of_a_part_it_is_not_told_which_messages_are_on_topics_that_are_not_described(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
-    with write(path) as file:
-        add(file, 99, 60, b"")
-    file.close()
-    assert not any(message.errors for part in ((5, None), (None, 60)) for message in messages_in(path, *part))
-
-
-def test_reading_leaves_nothing_beside_the_file(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
+def test_reading_leaves_nothing_beside_the_file(tmp_path: Path, path: Path) -> None:
     with closing(sqlite3.connect(path)) as file:
         file.execute("PRAGMA journal_mode = WAL")
     write(path).close()
@@ -177,8 +152,7 @@ def test_a_name_that_looks_like_a_part_of_an_address_is_only_a_name(tmp_path: Pa
     assert batches_in(path) == IN_ORDER
 
 
-def test_a_message_that_is_no_message_is_counted(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
+def test_a_message_that_is_no_message_is_counted(path: Path) -> None:
     with write(path) as file:
         for data in (None, "text", 7, b"\0"):
             add(file, 2, 50, data)
@@ -186,8 +160,7 @@ def test_a_message_that_is_no_message_is_counted(tmp_path: Path) -> None:
     assert [error.reason for message in messages_in(path) for error in message.errors] == ["truncated"] * 4
 
 
-def test_another_database_is_no_recording(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
+def test_another_database_is_no_recording(path: Path) -> None:
     with sqlite3.connect(path) as file:
         file.execute("CREATE TABLE people(name TEXT)")
     file.close()
@@ -198,8 +171,7 @@ def test_another_database_is_no_recording(tmp_path: Path) -> None:
     assert not is_open(path)
 
 
-def test_a_name_that_is_no_text_is_damage(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
+def test_a_name_that_is_no_text_is_damage(path: Path) -> None:
     write(path).close()
     path.write_bytes(path.read_bytes().replace(b"tabletopicstopics", b"tabletopic\xfftopics"))
     with pytest.raises(RecordingError, match="it cannot be read as a recording of ROS 2") as raised:
@@ -208,8 +180,7 @@ def test_a_name_that_is_no_text_is_damage(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("received", [0, 50])
-def test_a_computed_column_cannot_claim_more_than_a_message_may_have(tmp_path: Path, received: int) -> None:
-    path = tmp_path / "run.db3"
+def test_a_computed_column_cannot_claim_more_than_a_message_may_have(path: Path, received: int) -> None:
     with write(path) as file:
         file.execute("ALTER TABLE messages RENAME TO stored")
         size = MAX_OTHER_MESSAGE + 1
@@ -222,26 +193,7 @@ def test_a_computed_column_cannot_claim_more_than_a_message_may_have(tmp_path: P
     assert (lost.received, promised.received) == (received, received)
 
 
-def test_what_cannot_be_read_is_told_behind_the_last_message_that_was(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
-    with write(path) as file:
-        file.execute("ALTER TABLE messages RENAME TO stored")
-        size = f"CASE WHEN timestamp < {_BLOCK + 7} THEN 1 ELSE {MAX_OTHER_MESSAGE + 1} END"
-        file.execute(f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data AS (zeroblob({size})))")
-        # So that they need not be sorted, for which all would be read.
-        file.execute("CREATE INDEX by_time ON messages(timestamp)")
-        for received in range(_BLOCK + 8):
-            file.execute("INSERT INTO messages(topic_id, timestamp) VALUES (2, ?)", (received,))
-    file.close()
-    *read, lost, promised = messages_in(path)
-    # SQLite's cursor is one row ahead.
-    assert [message.received for message in read] == list(range(_BLOCK + 6))
-    assert "nothing more can be read" in str(lost.errors[0])
-    assert (lost.received, promised.received) == (_BLOCK + 5, _BLOCK + 5)
-
-
-def test_a_file_that_one_thread_has_opened_is_read_and_closed_by_another(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
+def test_a_file_that_one_thread_has_opened_is_read_and_closed_by_another(path: Path) -> None:
     write(path).close()
     with ThreadPoolExecutor(1) as other:
         recording = other.submit(open_recording, path).result()
@@ -250,8 +202,7 @@ def test_a_file_that_one_thread_has_opened_is_read_and_closed_by_another(tmp_pat
     assert not is_open(path)
 
 
-def test_a_file_that_is_cut_is_refused_or_gives_what_is_left_and_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
+def test_a_file_that_is_cut_is_refused_or_gives_what_is_left_and_says_so(path: Path) -> None:
     with write(path) as file:
         for received in range(100, 2_000):
             add(file, 2, received, encode([moving("odom", "base", received)]))
@@ -290,9 +241,8 @@ def killed_writer(path: Path, mode: str) -> None:
 @pytest.mark.parametrize(("mode", "journal"), [("DELETE", "-journal"), ("WAL", "-wal")])
 @pytest.mark.parametrize("shared", [True, False])
 def test_what_a_killed_writer_had_not_finished_is_undone_in_a_copy_and_told(
-    tmp_path: Path, mode: str, journal: str, shared: bool
+    tmp_path: Path, path: Path, mode: str, journal: str, shared: bool
 ) -> None:
-    path = tmp_path / "run.db3"
     killed_writer(path, mode)
     assert Path(f"{path}{journal}").stat().st_size > 0
     if not shared:
@@ -365,8 +315,7 @@ def test_a_column_may_hold_anything(
         assert read + ignored == len(messages) or any(message.is_report for message in found)
 
 
-def test_timestamps_that_are_no_integers_are_counted(tmp_path: Path) -> None:
-    path = tmp_path / "run.db3"
+def test_timestamps_that_are_no_integers_are_counted(path: Path) -> None:
     with write(path) as file:
         for received in (None, "noon", b"\1", 0.5, float("inf")):
             file.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (2, ?, ?)", (received, b""))
