@@ -24,7 +24,7 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from tfbus import SimulatedClock
-from tfbus.cli import tutorial
+from tfbus.cli.commands import tutorial
 from tfbus.testing import simulate
 
 DEMOS = Path(__file__).parents[2] / "demos"
@@ -36,7 +36,7 @@ def load(name: str) -> dict[str, Any]:
 
 @pytest.mark.anyio
 async def test_the_script_prints_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
-    await tutorial.run(SimulatedClock(), duration=3.0)
+    await tutorial.run_robot(SimulatedClock(), duration=3.0)
     command = capsys.readouterr().out
 
     demo = load("robot_setup.py")

@@ -12,8 +12,8 @@ from support.programs import PATIENCE, TFBUS, free_address, start_tfbus
 from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, Transform, TransformStamped, from_seconds
-from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.commands.echo import describe, to_json
+from tfbus.cli.domain import ReplayClock
 from tfbus.links.zenoh import BufferServer
 
 MOVING = TransformStamped(

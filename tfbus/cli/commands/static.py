@@ -9,9 +9,8 @@ import anyio
 from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
-from tfbus.cli._static_frames import publish_static
 from tfbus.cli.arguments import UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, publish_static
 from tfbus.cli.output import format_numbers, format_transform, say, warn
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import MAX_TRANSLATION, TransformStamped, check_translations

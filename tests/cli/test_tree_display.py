@@ -1,10 +1,12 @@
+"""The tree of frames as it is drawn."""
+
 import sys
 
 import pytest
 from support.terminal import Terminal
 
 from tfbus import SECOND, Edge
-from tfbus.cli._tree_display import TreeDisplay, tree_lines
+from tfbus.cli.tree_display import TreeDisplay, tree_lines
 from tfbus.tree.rendering import describe
 
 MOVING = Edge("map", "base_link", False, 101, 2 * SECOND, 4 * SECOND, "odometry")
