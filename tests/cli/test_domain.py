@@ -15,13 +15,22 @@ import pytest
 from support.asking import settle
 from support.commands import START, Command, check_wrong_call
 from support.processes import new_domain
-from support.programs import Program, start_tfbus
+from support.programs import PATIENCE, Program, start_tfbus
 from support.robot_of_ros import URDF
 from support.samples import moving, static
 
-from tfbus import SECOND, Buffer, Bus, ClockResetError, SimulatedClock, from_seconds
+from tfbus import SECOND, Buffer, Bus, ClockResetError, SimulatedClock, TransformStamped, from_seconds
 from tfbus.cli.arguments import UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, ReplayClock, is_ros, publish_static, ros_link, run
+from tfbus.cli.domain import (
+    DEFAULT_LINK,
+    LinkOptions,
+    RemoteLookups,
+    ReplayClock,
+    is_ros,
+    publish_static,
+    ros_link,
+    run,
+)
 from tfbus.testing import simulate
 
 BACKENDS = ["asyncio", "trio"]
@@ -36,33 +45,20 @@ def join(options: LinkOptions) -> None:
     options.run(stay_for_a_moment)
 
 
-def test_a_program_for_a_remote_buffer_gets_the_robot_and_the_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
-    from tfbus.links import zenoh
+def test_a_program_asks_the_buffer_of_a_robot_and_of_one_robot_only() -> None:
+    from tfbus.links.zenoh import BufferServer
 
-    asked: list[tuple[str, dict[str, object]]] = []
+    domain = new_domain()
 
-    class Client:
-        def __init__(self, domain: str, **options: object) -> None:
-            asked.append((domain, options))
+    async def serve_and_ask(remote: RemoteLookups) -> TransformStamped:
+        with Bus() as bus, Buffer(bus) as buffer:
+            bus.publish(static("map", "base", 2.0))
+            async with BufferServer(buffer, domain, robot="r1"):
+                return await remote.lookup("map", "base", timeout=PATIENCE)
 
-        async def __aenter__(self) -> "Client":
-            return self
-
-        async def __aexit__(self, *_: object) -> None:
-            pass
-
-    async def program(remote: object) -> bool:
-        await anyio.lowlevel.checkpoint()
-        return isinstance(remote, Client)
-
-    monkeypatch.setattr(zenoh, "BufferClient", Client)
-    listen, connect = ("tcp/127.0.0.1:1",), ("tcp/127.0.0.1:2", "tcp/127.0.0.1:3")
-    assert LinkOptions("yard", listen=listen, connect=connect, robots=("r1",)).run_remote(program)
-    assert LinkOptions("yard").run_remote(program)
-    assert asked == [
-        ("yard", {"robot": "r1", "listen": listen, "connect": connect}),
-        ("yard", {"robot": None, "listen": None, "connect": None}),
-    ]
+    assert LinkOptions(domain, robots=("r1",)).run_remote(serve_and_ask).transform.translation == (2.0, 0.0, 0.0)
+    with pytest.raises(UsageError, match="one robot"):
+        LinkOptions(domain, robots=("r1", "r2")).run_remote(serve_and_ask)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -18,7 +18,7 @@ from support.processes import new_domain, until
 from support.programs import TFBUS, free_address, start_tfbus
 from support.recorded import SMALL, WRONG_IN_SMALL, messages_in, write_mcap
 from support.samples import moving, static
-from support.terminal import Terminal, on_a_terminal
+from support.terminal import Terminal
 
 from tfbus import SECOND, Bus, PeerJoined, SystemClock, TransformStamped
 from tfbus.cli.commands.play import Keyboard, keyboard, press
@@ -208,27 +208,6 @@ def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
     ten_seconds: Path, arguments: Sequence[str], why: str, tfbus: Command
 ) -> None:
     check_wrong_call(tfbus("play", ten_seconds, *arguments), why)
-
-
-@pytest.mark.parametrize("content", [None, b"", b"no recording", b"\x89MCAP0\r\n", b"\x89MC"])
-def test_a_file_that_is_no_recording_is_one_line_and_status_2(
-    tmp_path: Path, content: bytes | None, tfbus: Command
-) -> None:
-    path = tmp_path / "run.mcap"
-    if content is not None:
-        path.write_bytes(content)
-    check_wrong_call(tfbus("play", path), f"recording '{path}': ")
-
-
-@pytest.mark.thorough
-def test_a_bar_is_on_standard_error_if_that_is_a_terminal(tmp_path: Path, ten_seconds: Path) -> None:
-    command = ("play", str(ten_seconds), "--rate", "20", "--domain", new_domain())
-    status, shown = on_a_terminal(tmp_path / "output", *command)
-    assert status == 0
-    assert (tmp_path / "output").read_text() == ""
-    assert "playing \x1b" in shown
-    assert re.search(r"[1-9]\d?%", shown)
-    assert "102 samples in 102 messages played" in shown
 
 
 @pytest.mark.anyio

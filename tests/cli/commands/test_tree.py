@@ -3,19 +3,14 @@
 import errno
 import json
 import os
-import pty
 import re
 import shutil
-import signal
-import subprocess
-from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from support.commands import START, Command, check_wrong_call
 from support.processes import new_domain
-from support.programs import PATIENCE, TFBUS, free_address, start_tfbus
+from support.programs import free_address, start_tfbus
 from support.samples import moving, static
 
 from tfbus import SECOND, Bus
@@ -139,42 +134,6 @@ def test_it_shows_what_programs_on_the_domain_send(backend: str) -> None:
         ):
             assert tree.wait() == 0
     assert re.fullmatch(TREE, tree.output.text)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(("environment", "coloured"), [({}, True), ({"NO_COLOR": "1"}, False)])
-def test_on_a_terminal_it_is_redrawn_in_place_and_in_colour_unless_forbidden(
-    environment: Mapping[str, str], coloured: bool
-) -> None:
-    options = ("--domain", new_domain())
-    screen, terminal = pty.openpty()
-    plain = {name: value for name, value in os.environ.items() if name not in {"NO_COLOR", "FORCE_COLOR"}}
-    with start_tfbus("static", "map", "odom", *options):
-        watch = subprocess.Popen(
-            [TFBUS, "tree", "--watch", "--rate", "20", *options],
-            stdin=terminal,
-            stdout=terminal,
-            stderr=terminal,
-            env={**plain, "TERM": "xterm-256color", **environment},
-            start_new_session=True,
-        )
-        os.close(terminal)
-        with watch:
-            seen = b""
-            # One line up, to the first of the two lines.
-            while seen.count(b"\x1b[1A") < 2:
-                seen += os.read(screen, 4096)
-            watch.send_signal(signal.SIGINT)
-            # At the end of the program, Linux raises an error.
-            with suppress(OSError):
-                while more := os.read(screen, 4096):
-                    seen += more
-            assert watch.wait(PATIENCE) == 130
-        os.close(screen)
-    assert (b"\x1b[36m" in seen) is coloured
-    # The cursor is shown at the end.
-    assert seen.rindex(b"\x1b[?25h") > seen.rindex(b"\x1b[?25l")
-    assert b"Traceback" not in seen
 
 
 def test_it_listens_until_each_frame_was_heard_twice_and_all_are_connected(tfbus: Command) -> None:
