@@ -71,7 +71,7 @@ def run(words: Sequence[str], loaded: Callable[[], object] = lambda: None) -> in
     Parameters
     ----------
     words : sequence of str
-        What a user types after ``tfbus``.
+        The words that a user types after ``tfbus``.
     loaded : callable
         Called once all modules of the subcommand are there, before it begins.
     """

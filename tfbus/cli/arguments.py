@@ -1,4 +1,4 @@
-"""The types of the arguments of the subcommands, and the error for those that cannot be used."""
+"""The types of the arguments of the subcommands, and the error for an argument that cannot be used."""
 
 import calendar
 import re

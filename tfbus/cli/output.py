@@ -31,7 +31,7 @@ _STEP = 4
 _GAP = "  "
 """The blanks between two columns of a table."""
 _FIRST_WINDOW = 0.3
-"""The time in s for which the first log line of a kind is held back, to count those that follow."""
+"""The time in s for which the first log line of a kind is held back, to count the lines that follow."""
 _LONGEST_WINDOW = 10.0
 
 
@@ -198,7 +198,7 @@ def progress_bar() -> Iterator[Any]:
 
 @contextmanager
 def progress(total: int | None, description: str) -> Iterator[Callable[[int], object]]:
-    """Show a progress bar for the body of a ``with``, if standard error is a terminal; yields what advances it."""
+    """Show a progress bar for the body of a ``with``, if standard error is a terminal; yields how to advance."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return
@@ -288,7 +288,7 @@ def log_lines(level: str, first_window: float = _FIRST_WINDOW) -> Iterator[None]
     ----------
     level : str
     first_window : float
-        The time in s for which the first line of a kind is held back, to count those that follow.
+        The time in s for which the first line of a kind is held back, to count the lines that follow.
     """
     logger = logging.getLogger("tfbus")
     handler = _FoldingHandler(first_window)
@@ -304,7 +304,7 @@ def log_lines(level: str, first_window: float = _FIRST_WINDOW) -> Iterator[None]
 
 
 class _FoldingHandler(logging.Handler):
-    """Prints the first line of a kind with the number of those that follow within a short time.
+    """Prints the first line of a kind with the number of lines that follow within a short time.
 
     Lines are of one kind if they differ only in their arguments. The time doubles each time that a kind comes again, up
     to `_LONGEST_WINDOW`, and nothing is lost: `close` prints what is still held back.

@@ -76,7 +76,7 @@ def play(
     start, end = _log_times(file, topics, since, until)
 
     async def play_to_domain(bus: Bus) -> int:
-        # That of a termination, which ends the tasks before the player has ended.
+        # The status of a termination, which cancels the tasks before the player has ended.
         status = ENDED_BY_SIGNAL + signal.SIGTERM
         player = Player(bus, file, rate=rate, loop=loop, since=start, until=end, **topics.arguments())
         await _wait_for_peer(bus)

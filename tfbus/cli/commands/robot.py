@@ -54,8 +54,8 @@ def robot(
     """Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at zero.
 
     Fixed joints are published once, the others again and again. A frame that is refused, because an edge of another
-    program is in its way, is tried again. A position beyond the limits of its joint is reported
-    and published all the same.
+    program is in its way, is tried again. A position beyond the limits of its joint is reported and
+    published all the same.
 
     Example: tfbus robot arm.urdf shoulder=0.5 elbow=-1.2 --tree
 
