@@ -262,6 +262,17 @@ def test_keys_steer_the_player_until_a_termination_and_the_terminal_is_as_before
         monkeypatch.setenv("TERM", "xterm")
     with typewriter(monkeypatch) as (ours, theirs):
         before = termios.tcgetattr(theirs)
+        raw = before[3] & ~(termios.ICANON | termios.ECHO)
+        while_stopped: list[object] = []
+        kill = os.kill
+
+        def stop_or_kill(process: int, number: int) -> None:
+            if number == signal.SIGSTOP:
+                while_stopped.append(termios.tcgetattr(theirs))
+            else:
+                kill(process, number)
+
+        monkeypatch.setattr(os, "kill", stop_or_kill)
 
         async def type_keys(received: list[TransformStamped]) -> None:
             for count, keys in enumerate((b" +s", b"\x1b[C"), 1):
@@ -270,11 +281,14 @@ def test_keys_steer_the_player_until_a_termination_and_the_terminal_is_as_before
             await until(partial(heard, received, 3))
             # The bar is drawn ten times a second.
             await until(lambda: not screen or "paused at 2 x" in shown.getvalue())
+            os.kill(os.getpid(), signal.SIGTSTP)
+            await until(lambda: len(while_stopped) == 1)
+            await until(lambda: termios.tcgetattr(theirs)[3] == raw)
             os.kill(os.getpid(), signal.SIGTERM)
             await anyio.sleep_forever()
 
         done, _ = play(tfbus, hour, "--backend", backend, then=type_keys)
-        assert termios.tcgetattr(theirs) == before
+        assert [*while_stopped, termios.tcgetattr(theirs)] == [before, before]
     lines = (shown.getvalue() if screen else done.stderr).splitlines()
     assert done.returncode == 128 + signal.SIGTERM
     assert any(line.startswith("space pauses, s or the right arrow plays the next message") for line in lines)
