@@ -18,7 +18,7 @@ from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
 import tfbus
-from tfbus.cli.tutorial import broadcast
+from tfbus.cli.commands.tutorial import send_laser
 from tfbus.plot import plot_transforms
 from tfbus.recording import load
 from tfbus.view import View
@@ -90,7 +90,7 @@ async def tutorial() -> None:
 
     with tfbus.Bus() as bus, tfbus.Buffer(bus) as buffer:
         async with View(bus, buffer, 0, rate=5.0) as view, anyio.create_task_group() as robot:
-            robot.start_soon(broadcast, bus)
+            robot.start_soon(send_laser, bus)
             await anyio.to_thread.run_sync(photograph, view.address, "view_tutorial.png", prepare)
             robot.cancel_scope.cancel()
 

@@ -1,27 +1,195 @@
-"""The options that all commands share."""
+"""The command as a whole: help, options of all commands, exit statuses, missing extras and closed pipes."""
 
 import inspect
 import logging
-import pkgutil
+import os
 import re
-from importlib import import_module
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
-from support.commands import Command, check_wrong_call, nobody
+from support.commands import Command, check_wrong_call
+from support.processes import PATIENCE, TFBUS, Program, new_domain
+from support.recorded import SMALL, write_mcap
+from support.samples import moving
 
-from tfbus import Bus
-from tfbus.cli import commands
-from tfbus.cli._overview import COMMANDS
-from tfbus.cli.arguments import CsvFlag, Flag, JsonFlag
+from tfbus import Bus, kernel
+from tfbus.cli.application import COMMANDS, application, run
+from tfbus.cli.arguments import CsvFlag, Flag, JsonFlag, UsageError
 from tfbus.cli.domain import LinkOptions
+from tfbus.errors import pip_install
+
+LINK = "--domain STR, --listen STR..., --connect STR..., --backend CHOICE"
+URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
+
+
+@pytest.fixture
+def instead(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., object]], None]:
+    """Have every command that joins a domain do something else."""
+    return lambda other: monkeypatch.setattr(LinkOptions, "run", other)
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("bridge", "FIRST, SECOND, --listen STR..., --connect STR..., --backend CHOICE"),
+        ("broadcast", f"--rate FLOAT, {LINK}"),
+        ("demo", "--duration, --rate, --listen-rate, --backend, --simulated, --no-broadcaster"),
+        ("echo", f"TARGET, SOURCE, --rate FLOAT, --max-age FLOAT, --json, {LINK}"),
+        ("check", f"WHAT, --from TIME, --max-speed FLOAT, --json, {LINK}"),
+        ("compare", "REFERENCE, ESTIMATE, --pair STR..., --scale, --json"),
+        ("convert", "SOURCE, FURTHER, --from TIME, --rename STR..., --drop-static, --overwrite"),
+        ("foxglove", f"--port INT, {LINK}"),
+        ("info", "FILE, --json, --wide, --namespaces"),
+        ("listen", f"--rate FLOAT, {LINK}"),
+        ("monitor", f"TARGET, SOURCE, --window FLOAT, --rate FLOAT, --once, --duration FLOAT, --json, {LINK}"),
+        ("play", f"FILE, --rate FLOAT, --loop, --from TIME, --to TIME, --topic STR..., {LINK}"),
+        ("plot", "FILE, FRAMES, --output, --path, --3d, --gaps, --text, --compare PATH"),
+        ("query", "FILE, TARGET, SOURCE, --at TIME, --every SECONDS, --tum, --csv, --json"),
+        ("record", f"FILE, --duration FLOAT, --overwrite, {LINK}"),
+        ("robot", f"FILE, POSITION, --tree, --rate FLOAT, --prefix STR, {LINK}"),
+        ("router", "--listen STR, --connect STR, --backend"),
+        ("static", f"PARENT, CHILD, --xyz, --rpy, --quaternion, --authority STR, {LINK}"),
+        ("tree", f"--duration FLOAT, --watch, --rate FLOAT, --dot PATH, --svg PATH, --json, {LINK}"),
+        ("view", f"FILE, --urdf PATH, --package-path PATH, --fixed STR, --trail STR, --port INT, {LINK}"),
+    ],
+)
+def test_the_help_of_a_command_has_an_example_every_option_and_the_defaults_that_do_something(
+    command: str, options: str, tfbus: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    done = tfbus(command, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"Example: tfbus {command}" in done.stdout
+    for option in options.split(", "):
+        assert re.search(rf"[│*] +{re.escape(option)}\b|{re.escape(option)} ", done.stdout), option
+    # Neither `--no-json` nor `--empty-listen`: those that cyclopts adds by itself mean nothing here.
+    assert re.findall(r"--(?:no|empty)-\w+", done.stdout) == (["--no-broadcaster"] if command == "demo" else [])
+    assert not set(re.findall(r"\[default:[\s│]*([^\]]*)\]", done.stdout)) & {"None", "False", "()", '""'}
+    assert "[default: warning]" in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    ("command", "defaults"),
+    [
+        ("check", "10.0 100000000.0 100.0 100.0 tf"),
+        ("compare", "0.01 1"),
+        ("demo", "inf 100.0 1.0"),
+        ("echo", "1.0 inf"),
+        ("foxglove", "8765 127.0.0.1 tf"),
+        ("robot", "10.0"),
+        ("view", "8080 127.0.0.1 30.0 tf"),
+    ],
+)
+def test_the_help_tells_the_defaults(
+    command: str, defaults: str, tfbus: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    found = re.findall(r"\[default: ([^\]]*)\]", tfbus(command, "--help").stdout)
+    assert " ".join(found).startswith(defaults)
+
+
+@pytest.mark.parametrize("columns", [60, 80, 200])
+def test_the_help_of_all_lists_the_commands_as_wide_as_the_terminal(
+    columns: int, tfbus: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    done = tfbus()
+    lines = done.stdout.splitlines()
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.findall(r"│ ([a-z]+) ", done.stdout) == sorted(COMMANDS)
+    assert {len(line) for line in lines if line.startswith(("╭", "│", "╰"))} == {columns}
+    assert max(map(len, lines)) <= columns
+    assert tfbus("--help").stdout.splitlines() == tfbus("-h").stdout.splitlines() == lines
+
+
+def test_the_help_names_the_exit_statuses_and_the_variables_of_the_environment(tfbus: Command) -> None:
+    for words in ((), ("tree", "--help")):
+        text = " ".join(tfbus(*words).stdout.split())
+        for fact in ("0 success", "1 a lookup", "2 wrong usage", "130", "143", "TFBUS_DOMAIN", "TFBUS_CONNECT"):
+            assert fact in text, fact
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_has_its_summary_in_the_list_and_no_option_that_cannot_be_switched_off(name: str) -> None:
+    function = application(name)[name].default_command
+    assert function is not None
+    assert (inspect.getdoc(function) or "").splitlines()[0].replace("`", "") == COMMANDS[name]
+    parameters = inspect.signature(function).parameters.values()
+    flags = [each for each in parameters if each.annotation in (Flag, JsonFlag, CsvFlag)]
+    assert [each.name for each in flags if each.default is not False] == []
+
+
+def test_the_version_is_that_of_the_package_with_the_kernel_that_runs(tfbus: Command) -> None:
+    done = tfbus("--version")
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{version('tfbus')} ({kernel} kernel)\n", "")
+
+
+def test_completion_is_written_for_a_shell_with_all_commands(
+    tfbus: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # It has the shell load the script at its start.
+    monkeypatch.setenv("HOME", str(tmp_path))
+    script = tmp_path / "tfbus.bash"
+    assert tfbus("--install-completion", "--shell", "bash", "--output", script).returncode == 0
+    assert str(script) in (tmp_path / ".bashrc").read_text()
+    assert set(COMMANDS) <= set(re.findall(r"\w+", script.read_text()))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (("no-such-command",), "no-such-command"),
+        (("tree", "--no-such-option"), "--no-such-option"),
+        (("tree", "surplus"), "surplus"),
+        (("info",), "FILE"),
+        (("info", SMALL, SMALL), str(SMALL)),
+        (("echo", "map"), "SOURCE"),
+        (("demo", "--rate", "0"), "--rate"),
+        (("demo", "--listen-rate=-1"), "--listen-rate"),
+        (("record", "a.mcap", "--duration", "-1"), "--duration"),
+        (("listen", "--backend", "curio"), "--backend"),
+        (("broadcast", "--listen", "rubbish"), "an address is like tcp/192.168.1.5:7447, not 'rubbish'"),
+        (("static", "map", "odom", "--domain", "a b"), "a domain is made of letters"),
+        (("listen", "--log-level", "loud"), "--log-level"),
+    ],
+)
+def test_a_usage_error_is_one_line_on_standard_error_and_status_2(
+    arguments: Sequence[object], why: str, tfbus: Command
+) -> None:
+    check_wrong_call(tfbus(*arguments), why)
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "lines"),
+    [
+        (ExceptionGroup("two tasks", [UsageError("one"), UsageError("two")]), 2, "tfbus: one\ntfbus: two\n"),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+)
+def test_errors_are_a_line_each_and_ctrl_c_is_silent(
+    error: BaseException, status: int, lines: str, tfbus: Command, instead: Callable[[Callable[..., object]], None]
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    instead(fail)
+    done = tfbus("tree")
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", lines)
 
 
 def test_a_domain_and_addresses_come_from_the_environment_unless_they_are_given(
-    tfbus: Command, monkeypatch: pytest.MonkeyPatch
+    tfbus: Command, instead: Callable[[Callable[..., object]], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[LinkOptions] = []
-    monkeypatch.setattr(LinkOptions, "run", lambda options, *_, **__: seen.append(options))
+    instead(lambda options, *_, **__: seen.append(options))
     monkeypatch.setenv("TFBUS_DOMAIN", "yard")
     monkeypatch.setenv("TFBUS_CONNECT", "tcp/10.0.0.1:7447 tcp/10.0.0.2:7447")
     tfbus("listen")
@@ -56,38 +224,115 @@ def test_the_log_level_chooses_the_lines_on_standard_error(
     assert logging.getLogger("tfbus").handlers == []
 
 
-def test_another_log_level_is_a_usage_error(tfbus: Command) -> None:
-    check_wrong_call(tfbus.on_domain(nobody, "listen", "--log-level", "loud"), "--log-level")
-
-
-def test_completion_is_written_for_a_shell_with_all_commands(
-    tfbus: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_caller_is_called_once_all_is_loaded_and_before_the_command(
+    instead: Callable[[Callable[..., object]], None],
 ) -> None:
-    # It has the shell load the script at its start.
-    monkeypatch.setenv("HOME", str(tmp_path))
-    script = tmp_path / "tfbus.bash"
-    done = tfbus("--install-completion", "--shell", "bash", "--output", script)
-    assert done.returncode == 0
-    assert str(script) in (tmp_path / ".bashrc").read_text()
-    assert set(COMMANDS) <= set(re.findall(r"\w+", script.read_text()))
+    steps: list[str] = []
+    instead(lambda *_, **__: steps.append("run"))
+    assert run(["listen"], lambda: steps.append("loaded")) == 0
+    assert run(["listen", "--no-such-option"], lambda: steps.append("loaded")) == 2
+    assert steps == ["loaded", "run"]
 
 
-MODULES = [module.name for module in pkgutil.iter_modules(commands.__path__)]
-
-
-@pytest.mark.parametrize("name", MODULES)
-def test_no_option_is_on_that_cannot_be_switched_off(name: str) -> None:
-    command = getattr(import_module(f"tfbus.cli.commands.{name}"), name)
-    parameters = inspect.signature(command).parameters.values()
-    flags = [each for each in parameters if each.annotation in (Flag, JsonFlag, CsvFlag)]
-    assert [each.name for each in flags if each.default is not False] == []
-
-
-@pytest.mark.parametrize("name", MODULES)
-def test_help_shows_the_defaults_that_do_something_and_has_no_option_for_an_empty_list(
-    name: str, tfbus: Command
+def test_a_reader_that_has_gone_is_no_error_and_not_told_again_at_the_end(
+    instead: Callable[[Callable[..., object]], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = tfbus(name, "--help").stdout
-    assert not set(re.findall(r"\[default:[\s│]*([^\]]*)\]", text)) & {"None", "False", "()", '""'}
-    assert "--empty" not in text
-    assert "[default: warning]" in text
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w", encoding="utf-8") as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        instead(lambda *_, **__: print("something"))
+        assert run(["listen"]) == 0
+        # As Python does when it ends.
+        print("more")
+        output.flush()
+
+
+def run_process(*command: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False, **options)
+
+
+@pytest.mark.thorough
+def test_letters_that_the_output_cannot_encode_are_escaped(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("map", "Straße", 1)])])
+    ascii_only = {**os.environ, "PYTHONIOENCODING": "ascii", "COLUMNS": "80"}
+    assert r"Stra\xdfe" in run_process(TFBUS, "info", str(path), env=ascii_only).stdout
+    # The help has boxes of other characters there.
+    assert run_process(TFBUS, env=ascii_only).stdout.isascii()
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("package", "arguments", "status", "message"),
+    [
+        ("cyclopts", "tree", 1, f"the command needs some packages more: {pip_install('cli')}"),
+        ("zenoh", "listen", 2, f"joining a domain needs a package more: {pip_install('cli,zenoh')}"),
+        ("mcap.writer", "record run.mcap --domain DOMAIN", 2, f"to record needs a package more: {pip_install('bag')}"),
+        (
+            "urdf_parser_py",
+            f"robot {URDF} --tree",
+            2,
+            f"to read URDF, tfbus needs a package more: {pip_install('urdf')}",
+        ),
+    ],
+)
+def test_a_missing_extra_is_named(package: str, arguments: str, status: int, message: str, tmp_path: Path) -> None:
+    hidden = f"import sys; sys.modules[{package!r}] = None; from tfbus.cli import main; main()"
+    words = arguments.replace("DOMAIN", new_domain()).split()
+    done = run_process(sys.executable, "-c", hidden, *words, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", f"tfbus: {message}\n")
+
+
+@pytest.mark.thorough
+def test_a_reader_that_closes_the_pipe_ends_the_command_silently(tmp_path: Path) -> None:
+    long = "name_" * 100
+    samples = [moving("a", f"{long}{number}", 1) for number in range(500)]
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", samples)])
+    # Unbuffered, Python would not report what the pipe did not take.
+    environment = {**os.environ, "PYTHONUNBUFFERED": ""}
+    for command in (("demo", "--simulated"), ("info", str(path))):
+        pipe = subprocess.PIPE
+        with subprocess.Popen([TFBUS, *command], stdout=pipe, stderr=pipe, env=environment) as process:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            # Both go on to print more than fits into a pipe.
+            assert process.stdout.readline() != b""
+            process.stdout.close()
+            errors = process.stderr.read()
+            status = process.wait(PATIENCE)
+        assert (command[0], status, errors) == (command[0], 0, b"")
+
+
+def test_the_help_of_all_loads_neither_an_optional_package_nor_numpy() -> None:
+    script = (
+        "import sys, tfbus.cli.application as cli; cli.run(['--help']); "
+        "print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    )
+    loaded = run_process(sys.executable, "-c", script).stdout.splitlines()[-1].split()
+    assert "tfbus" in loaded
+    assert set(loaded) & {"zenoh", "trio", "mcap", "rosbags", "lxml", "numpy", "anyio"} == set()
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_silently_whenever_it_comes(number: signal.Signals) -> None:
+    statuses = set()
+    for step in range(16):
+        with Program(sys.executable, "-X", "importtime", TFBUS, "tree", "--domain", new_domain()) as tree:
+            # Python itself shows a traceback of its own start: until a module is loaded by the command.
+            tree.errors.expect(r"\| +tfbus\.cli$")
+            tree.errors.expect("import time")
+            time.sleep(0.05 * step)
+            statuses.add(tree.end(number))
+        said = [line for line in tree.errors.text.splitlines() if not line.startswith("import time:")]
+        assert not said or (len(said) == 1 and said[0].startswith("waiting for transforms"))
+    assert statuses <= {-number, 128 + number}
+
+
+@pytest.mark.thorough
+def test_where_ctrl_c_is_ignored_a_termination_ends_it() -> None:
+    script = 'trap "" INT; exec "$0" tree --domain "$1"'
+    with Program("sh", "-c", script, TFBUS, new_domain()) as tree:
+        tree.errors.expect("waiting")
+        tree.process.send_signal(signal.SIGINT)
+        assert tree.end(signal.SIGTERM) == -signal.SIGTERM

@@ -1,3 +1,5 @@
+"""The types of arguments."""
+
 from collections.abc import Callable
 from typing import Any
 
@@ -16,12 +18,12 @@ from tfbus.cli.arguments import (
     Speed,
     Step,
     Time,
-    TopicOptions,
     UsageError,
     parse_seconds,
     parse_time,
 )
 from tfbus.cli.output import format_seconds
+from tfbus.cli.recordings import TopicOptions
 
 LIMIT = 9_223_372_036 * 1_000_000_000
 
@@ -80,46 +82,41 @@ def parse(kind: Any, *arguments: str) -> object:
 
 
 @pytest.mark.parametrize(
-    ("kind", "arguments", "value"),
+    ("kind", "argument", "value"),
     [
-        (Rate, ["--option", "0.5"], 0.5),
-        (Speed, ["--option", "inf"], float("inf")),
-        (Duration, ["--option", "0"], 0.0),
-        (Duration, ["--option", "inf"], float("inf")),
-        (Instant, ["--option=1.5"], Time(1_500_000_000, False)),
-        (Instant, ["--option", "2014-03-31T19:24:50"], Time(1_396_293_890_000_000_000, True)),
-        (Step, ["--option", "0.000000001"], 1),
-        (Backend, ["--option", "trio"], "trio"),
-        (Flag, ["--option"], True),
-        (JsonFlag, ["--json"], True),
+        (Rate, "--option=0.5", 0.5),
+        (Speed, "--option=inf", float("inf")),
+        (Duration, "--option=0", 0.0),
+        (Duration, "--option=inf", float("inf")),
+        (Instant, "--option=1.5", Time(1_500_000_000, False)),
+        (Instant, "--option=2014-03-31T19:24:50", Time(1_396_293_890_000_000_000, True)),
+        (Step, "--option=0.000000001", 1),
+        (Backend, "--option=trio", "trio"),
+        (Flag, "--option", True),
+        (JsonFlag, "--json", True),
     ],
 )
-def test_an_argument_is_converted_to_its_type(kind: Any, arguments: list[str], value: object) -> None:
-    assert parse(kind, *arguments) == value
+def test_an_argument_is_converted_to_its_type(kind: Any, argument: str, value: object) -> None:
+    assert parse(kind, argument) == value
 
 
 @pytest.mark.parametrize(
-    ("kind", "argument"),
+    ("kind", "wrong"),
     [
-        (Rate, "--option=0"),
-        (Rate, "--option=inf"),
-        (Rate, "--option=nan"),
-        (Speed, "--option=0"),
-        (Speed, "--option=nan"),
-        (Duration, "--option=-1"),
-        (Duration, "--option=nan"),
-        (Instant, "--option=noon"),
-        (Instant, "--option=-1"),
-        (Step, "--option=0"),
-        (Step, "--option=-1"),
+        (Rate, "--option=0 --option=inf --option=nan"),
+        (Speed, "--option=0 --option=nan"),
+        (Duration, "--option=-1 --option=nan"),
+        (Instant, "--option=noon --option=-1"),
+        (Step, "--option=0 --option=-1"),
         (Backend, "--option=curio"),
         (Flag, "--no-option"),
         (JsonFlag, "--no-json"),
     ],
 )
-def test_an_argument_that_its_type_does_not_allow_is_an_error(kind: Any, argument: str) -> None:
-    with pytest.raises(CycloptsError):
-        parse(kind, argument)
+def test_an_argument_that_its_type_does_not_allow_is_an_error(kind: Any, wrong: str) -> None:
+    for argument in wrong.split():
+        with pytest.raises(CycloptsError):
+            parse(kind, argument)
 
 
 @pytest.mark.parametrize(

@@ -1,22 +1,35 @@
+"""Joining a domain or ROS: addresses, event loops, the clock of a replay, and static frames."""
+
 import errno
 import os
 import re
 import signal
 import socket
 import sys
-from collections.abc import Callable, Coroutine
-from typing import Any
+import time
+from pathlib import Path
 
 import anyio
 import anyio.lowlevel
 import pytest
+from support.asking import settle
+from support.both_sides import URDF
 from support.commands import START, Command, check_wrong_call
-from support.processes import Program, new_domain
-from support.samples import static
+from support.processes import PATIENCE, Program, new_domain, start_tfbus
+from support.samples import moving, static
 
-from tfbus import Bus, SimulatedClock, from_seconds
+from tfbus import SECOND, Buffer, Bus, ClockResetError, SimulatedClock, TransformStamped, from_seconds
 from tfbus.cli.arguments import UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.domain import (
+    DEFAULT_LINK,
+    LinkOptions,
+    RemoteLookups,
+    ReplayClock,
+    is_ros,
+    publish_static,
+    ros_link,
+    run,
+)
 from tfbus.testing import simulate
 
 BACKENDS = ["asyncio", "trio"]
@@ -31,33 +44,20 @@ def join(options: LinkOptions) -> None:
     options.run(stay_for_a_moment)
 
 
-def test_a_program_for_a_remote_buffer_gets_the_robot_and_the_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
-    from tfbus.links import zenoh
+def test_a_program_asks_the_buffer_of_a_robot_and_of_one_robot_only() -> None:
+    from tfbus.links.zenoh import BufferServer
 
-    asked: list[tuple[str, dict[str, object]]] = []
+    domain = new_domain()
 
-    class Client:
-        def __init__(self, domain: str, **options: object) -> None:
-            asked.append((domain, options))
+    async def serve_and_ask(remote: RemoteLookups) -> TransformStamped:
+        with Bus() as bus, Buffer(bus) as buffer:
+            bus.publish(static("map", "base", 2.0))
+            async with BufferServer(buffer, domain, robot="r1"):
+                return await remote.lookup("map", "base", timeout=PATIENCE)
 
-        async def __aenter__(self) -> "Client":
-            return self
-
-        async def __aexit__(self, *_: object) -> None:
-            pass
-
-    async def program(remote: object) -> bool:
-        await anyio.lowlevel.checkpoint()
-        return isinstance(remote, Client)
-
-    monkeypatch.setattr(zenoh, "BufferClient", Client)
-    listen, connect = ("tcp/127.0.0.1:1",), ("tcp/127.0.0.1:2", "tcp/127.0.0.1:3")
-    assert LinkOptions("yard", listen=listen, connect=connect, robots=("r1",)).run_remote(program)
-    assert LinkOptions("yard").run_remote(program)
-    assert asked == [
-        ("yard", {"robot": "r1", "listen": listen, "connect": connect}),
-        ("yard", {"robot": None, "listen": None, "connect": None}),
-    ]
+    assert LinkOptions(domain, robots=("r1",)).run_remote(serve_and_ask).transform.translation == (2.0, 0.0, 0.0)
+    with pytest.raises(UsageError, match="one robot"):
+        LinkOptions(domain, robots=("r1", "r2")).run_remote(serve_and_ask)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -75,33 +75,21 @@ def test_two_programs_of_a_domain_hear_each_other_and_return_their_results(backe
     assert options.run(meet) == "met"
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_ctrl_c_ends_a_program(backend: str) -> None:
-    async def interrupt(_: Bus) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-        await anyio.sleep_forever()
-
-    with pytest.raises(KeyboardInterrupt):
-        LinkOptions(new_domain(), backend=backend).run(interrupt)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize(
     "address",
     [
-        "",
-        "7447",
-        "127.0.0.1:7447",
-        "foo/127.0.0.1:7447",
-        "tcp",
-        "tcp/",
-        "tcp/:7447",
-        "tcp/127.0.0.1",
-        "tcp/127.0.0.1:",
-        "tcp/127.0.0.1:x",
-        "tcp/127.0.0.1:7447 ",
-        "tcp/127.0.0.1:65536",
-        "tcp//127.0.0.1:7447",
-        "tcp/::1:7447",
+        *(
+            "",
+            "7447",
+            "127.0.0.1:7447",
+            "foo/127.0.0.1:7447",
+            "tcp",
+            "tcp/",
+            "tcp/:7447",
+            "tcp/127.0.0.1",
+            "tcp/::1:7447",
+        ),
+        *("tcp/127.0.0.1:", "tcp/127.0.0.1:x", "tcp/127.0.0.1:7447 ", "tcp/127.0.0.1:65536", "tcp//127.0.0.1:7447"),
     ],
 )
 def test_an_address_that_no_program_can_have_is_a_usage_error(address: str) -> None:
@@ -109,20 +97,10 @@ def test_an_address_that_no_program_can_have_is_a_usage_error(address: str) -> N
         join(LinkOptions(new_domain(), connect=(address,)))
 
 
-@pytest.mark.parametrize(
-    "address",
-    [
-        "tcp/127.0.0.1:1",
-        "tcp/127.0.0.1:1?prio=1-7",
-        "tcp/[::1]:1",
-        "tls/localhost:1#root_ca_certificate=/nowhere/ca.pem",
-        "udp/localhost:1",
-        "unixsock-stream//nowhere/at/all",
-        "ws/127.0.0.1:1",
-    ],
-)
-def test_an_address_of_any_protocol_is_tried_in_the_background(address: str) -> None:
-    join(LinkOptions(new_domain(), connect=(address,)))
+def test_an_address_of_any_protocol_is_tried_in_the_background() -> None:
+    tcp = ("tcp/127.0.0.1:1", "tcp/127.0.0.1:1?prio=1-7", "tcp/[::1]:1", "ws/127.0.0.1:1", "udp/localhost:1")
+    others = ("tls/localhost:1#root_ca_certificate=/nowhere/ca.pem", "unixsock-stream//nowhere/at/all")
+    join(LinkOptions(new_domain(), connect=tcp + others))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -133,50 +111,31 @@ def test_an_address_in_use_is_a_usage_error(backend: str, tfbus: Command) -> Non
     check_wrong_call(done, f"cannot listen at {address}: {os.strerror(errno.EADDRINUSE)}")
 
 
-def test_a_domain_that_cannot_exist_is_a_usage_error() -> None:
-    with pytest.raises(UsageError, match="a domain is made of letters"):
-        join(LinkOptions("a b"))
-
-
 def test_without_its_extra_joining_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tfbus.links.zenoh", None)
     with pytest.raises(UsageError, match=re.escape('needs a package more: pip install "tfbus[cli,zenoh]"')):
         join(DEFAULT_LINK)
 
 
-async def publish_soon(bus: Bus) -> None:
-    await bus.clock.sleep(0.9)
-    bus.publish(static("map", "odom"))
-
-
-async def publish_late(bus: Bus) -> None:
-    await bus.clock.sleep(60.0)
-    bus.publish(static("map", "odom"))
-
-
-@pytest.mark.parametrize(
-    ("publish", "seconds", "notice"),
-    [
-        (publish_soon, 0.9, ""),
-        (publish_late, 60, "waiting for transforms on domain 'yard' …\n"),
-    ],
-)
+@pytest.mark.parametrize(("seconds", "notice"), [(0.9, ""), (60.0, "waiting for transforms on domain 'yard' …\n")])
 def test_waiting_for_the_first_transform_is_announced_once_if_it_takes_more_than_a_second(
-    publish: Callable[[Bus], Coroutine[Any, Any, None]], seconds: float, notice: str, capsys: pytest.CaptureFixture[str]
+    seconds: float, notice: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    async def wait() -> int:
-        clock = SimulatedClock(START)
+    clock = SimulatedClock(START)
 
-        async def wait_beside_publisher() -> int:
-            with Bus(clock) as bus:
-                async with anyio.create_task_group() as tasks:
-                    tasks.start_soon(publish, bus)
-                    await LinkOptions("yard").first_transform(bus)
-                return clock.now()
+    async def wait_beside_publisher() -> int:
+        with Bus(clock) as bus:
 
-        return await simulate(clock, wait_beside_publisher)
+            async def publish() -> None:
+                await clock.sleep(seconds)
+                bus.publish(static("map", "odom"))
 
-    assert anyio.run(wait) == START + from_seconds(seconds)
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(publish)
+                await LinkOptions("yard").first_transform(bus)
+            return clock.now()
+
+    assert anyio.run(simulate, clock, wait_beside_publisher) == START + from_seconds(seconds)
     assert capsys.readouterr() == ("", notice)
 
 
@@ -211,3 +170,217 @@ print("done")
     with Program(sys.executable, "-c", script) as program:
         assert program.wait() == 0
     assert (program.output.text, program.errors.text) == ("done\n", "")
+
+
+def press_ctrl_c() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_ctrl_c_cancels_and_is_raised_after_the_cleanup_even_if_pressed_again(backend: str) -> None:
+    ended = []
+
+    async def main() -> None:
+        try:
+            press_ctrl_c()
+            await anyio.sleep_forever()
+        finally:
+            with anyio.CancelScope(shield=True):
+                for _ in range(3):
+                    press_ctrl_c()
+                    await anyio.sleep(0.01)
+            ended.append(backend)
+
+    with pytest.raises(KeyboardInterrupt):
+        run(main, backend)
+    assert ended == [backend]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_ctrl_c_is_raised_even_if_the_function_ends_by_itself_and_an_error_without_a_group(backend: str) -> None:
+    async def end() -> None:
+        with anyio.CancelScope(shield=True):
+            press_ctrl_c()
+            await anyio.sleep(0.01)
+
+    async def fail() -> None:
+        raise OSError("no")
+
+    async def fail_in_the_cleanup() -> None:
+        try:
+            press_ctrl_c()
+            await anyio.sleep_forever()
+        finally:
+            raise OSError("no")
+
+    with pytest.raises(KeyboardInterrupt):
+        run(end, backend)
+    for main in (fail, fail_in_the_cleanup):
+        with pytest.raises(OSError, match="no"):
+            run(main, backend)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_ctrl_c_stays_ignored_where_it_was_ignored(backend: str) -> None:
+    done = []
+
+    async def main() -> None:
+        press_ctrl_c()
+        await anyio.sleep(0.01)
+        done.append(backend)
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        run(main, backend)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert done == [backend]
+
+
+THEN = 1_400_000_000 * SECOND
+
+
+@pytest.mark.anyio
+async def test_it_is_the_machine_s_time_until_a_stamp_is_heard_and_then_that() -> None:
+    clock = ReplayClock()
+    jumps: list[tuple[int, int]] = []
+    registration = clock.on_jump(lambda before, after: jumps.append((before, after)))
+    earlier = time.time_ns()
+    assert earlier <= clock.now() <= time.time_ns()
+    clock.hear(THEN)
+    clock.hear(THEN + 5)
+    assert clock.now() == THEN + 5
+    assert jumps == [(THEN, THEN)], "it is another clock's time, so no jump back"
+    clock.hear(THEN - 1)
+    assert jumps[1:] == [(THEN + 5, THEN - 1)]
+    registration.close()
+    clock.hear(THEN - 2)
+    assert len(jumps) == 2
+
+
+@pytest.mark.anyio
+async def test_what_arrives_before_the_first_time_of_a_simulation_stays_and_nothing_is_told(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    clock = ReplayClock()
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        assert not clock.is_set
+        bus.publish(moving("odom", "base", 100 * SECOND))
+        for second in (100, 101):
+            clock.hear(second * SECOND)
+        assert clock.is_set
+        assert buffer.lookup_nowait("odom", "base").stamp == 100 * SECOND
+        assert (bus.statistics().clock_resets, bus.statistics().behind, caplog.records) == (0, 0, [])
+        bus.publish(moving("odom", "base", 101))
+        assert bus.statistics().behind == 1
+        clock.hear(50 * SECOND)
+        assert bus.statistics().clock_resets == 1
+
+
+@pytest.mark.anyio
+async def test_sleep_until_waits_for_the_time_that_is_told() -> None:
+    clock = ReplayClock()
+    await clock.sleep_until(clock.now() + SECOND // 1_000)
+    clock.hear(THEN)
+    ended: list[str] = []
+
+    async def sleep() -> None:
+        try:
+            await clock.sleep_until(THEN + SECOND)
+        except ClockResetError:
+            ended.append("reset")
+        else:
+            ended.append("reached")
+
+    for last, result in ((THEN + SECOND, "reached"), (THEN - 1, "reset")):
+        async with anyio.create_task_group() as tasks:
+            clock.hear(THEN)
+            tasks.start_soon(sleep)
+            await settle()
+            clock.hear(THEN + 7)
+            await settle()
+            clock.hear(last)
+        assert ended.pop() == result
+
+
+def test_a_place_of_ros_is_told_from_a_domain() -> None:
+    assert all(map(is_ros, ("dds", "dds:42", "ws://a:9090", "wss://a", "zenoh:robot:7447")))
+    assert not any(map(is_ros, ("zenoh:robot", "tf", "dds/a", "adds", "domain:dds")))
+
+
+@pytest.mark.parametrize(
+    ("extra", "place", "what", "value"),
+    [
+        ("cyclonedds", "dds", "domain", 5),
+        ("cyclonedds", "dds:42", "domain", 42),
+        ("zenoh", "zenoh:robot:7447", "domain", 5),
+        ("wsproto", "ws://robot:9091", "url", "ws://robot:9091"),
+    ],
+)
+def test_a_place_becomes_a_link(
+    extra: str, place: str, what: str, value: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip(extra)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "5")
+    assert getattr(ros_link(Bus(), place), what, None) == value
+
+
+@pytest.mark.parametrize(
+    ("place", "why"),
+    [("tf", "no place of ROS: write dds"), ("dds:x", "no place"), ("dds:300", "0 to 232"), ("ws://", "no URL")],
+)
+def test_what_is_no_place_of_ros_is_a_usage_error(place: str, why: str) -> None:
+    for extra in ("cyclonedds", "wsproto"):
+        pytest.importorskip(extra)
+    with pytest.raises(UsageError, match=why):
+        ros_link(Bus(), place)
+
+
+@pytest.mark.thorough
+def test_every_command_that_joins_a_domain_joins_ros(tmp_path: Path) -> None:
+    for extra in ("cyclonedds", "urdf_parser_py"):
+        pytest.importorskip(extra)
+    number = 100 + os.getpid() % 99
+    ros, other = ("--ros", f"dds:{number}"), ("--ros", f"dds:{number + 1}")
+    recording, urdf = str(tmp_path / "drive.mcap"), tmp_path / "arm.urdf"
+    urdf.write_text(URDF)
+    with (
+        start_tfbus("broadcast", *ros) as broadcast,
+        start_tfbus("static", "base_laser", "camera", "--xyz", "1", "0", "0", *ros),
+        start_tfbus("robot", str(urdf), *ros) as robot,
+        start_tfbus("listen", *ros) as listen,
+    ):
+        assert broadcast.errors.expect("broadcasting").endswith(f"on ROS at dds:{number}, until Ctrl-C")
+        assert "base_link" in listen.output.expect("base_laser")
+        assert f"on ROS at dds:{number}" in robot.errors.expect("publishing")
+        with start_tfbus("echo", "base_link", "camera", *ros) as echo, start_tfbus("record", recording, *ros) as record:
+            echo.output.expect("Translation")
+            record.errors.expect("recording ROS at")
+            with start_tfbus("tree", *ros) as tree:
+                assert tree.wait() == 0
+            assert {"base_laser", "camera", "hand"} <= set(re.findall(r"\w+", tree.output.text))
+            assert record.end() == 130
+    with start_tfbus("echo", "base_link", "camera", *other) as there, start_tfbus("play", recording, *other) as play:
+        play.errors.expect(f"on ROS at dds:{number + 1}")
+        there.output.expect("Translation")
+
+
+@pytest.mark.anyio
+async def test_a_refused_frame_is_shown_once_and_published_when_its_place_is_free(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    clock = SimulatedClock()
+    with Bus(clock) as bus:
+        bus.publish(moving("laser", "base", 0, authority="stranger"))
+
+        async def free_and_publish() -> None:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(publish_static, bus, [static("base", "laser"), static("base", "arm")])
+                await clock.sleep(2.5)
+                bus.remove_frame("base")
+
+        await simulate(clock, free_and_publish)
+        assert bus.statistics().frames == 2
+    errors = capsys.readouterr().err
+    assert errors.count("refused, and tried again once a second: the edge 'base' -> 'laser' would close a loop") == 1
+    assert clock.now() == 3_000_000_000

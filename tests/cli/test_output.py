@@ -1,26 +1,42 @@
+"""Lines, tables, progress, values as text, files and log lines."""
+
 import csv
 import errno
 import io
+import logging
 import os
 import re
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+from support.processes import PATIENCE, TFBUS
+from support.recorded import SMALL
+from support.terminal import Terminal, on_a_terminal
 
 from tfbus import Transform
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.output import (
+    Column,
+    cells,
     csv_name,
     csv_writer,
     format_counts,
     format_numbers,
     format_seconds,
     format_transform,
+    log_lines,
     print_now,
     say,
+    shorten,
+    shorten_widest,
+    table_lines,
+    terminal_width,
     track,
     warn,
+    wrapped,
     write_file,
 )
 
@@ -61,33 +77,13 @@ def test_lines_leave_a_buffered_stream_at_once(stream: str, monkeypatch: pytest.
     assert received.getvalue() == b"line\n"
 
 
-@pytest.mark.parametrize(
-    ("nanoseconds", "text"),
-    [(0, "0.000000000"), (1, "0.000000001"), (-1, "-0.000000001"), (-1_500_000_000, "-1.500000000")],
-)
-def test_seconds_have_nine_decimals(nanoseconds: int, text: str) -> None:
-    assert format_seconds(nanoseconds) == text
-
-
-def test_numbers_have_no_needless_digits_and_no_negative_zero() -> None:
+def test_values_are_texts_for_people() -> None:
+    nanoseconds = {0: "0.000000000", 1: "0.000000001", -1: "-0.000000001", -1_500_000_000: "-1.500000000"}
+    assert {each: format_seconds(each) for each in nanoseconds} == nanoseconds
     assert format_numbers([1.5, -0.25, -0.0, 1 / 3]) == "1.5 -0.25 0 0.333333"
-
-
-def test_a_transform_has_its_units() -> None:
     transform = Transform.from_xyz_rpy((1.5, 0.0, -0.25), (0.1, -0.2, 0.3))
     assert format_transform(transform) == "xyz 1.5 0 -0.25 m, rpy 0.1 -0.2 0.3 rad"
-
-
-def test_counts_keep_their_order() -> None:
     assert format_counts({"not finite": 1_234, "cycle": 1}) == "1,234 x not finite, 1 x cycle"
-    assert format_counts({}) == ""
-
-
-def test_items_are_tracked_without_a_bar_where_standard_error_is_no_terminal(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert list(track(iter("abc"), None, "reading")) == ["a", "b", "c"]
-    assert capsys.readouterr() == ("", "")
 
 
 def test_a_file_is_replaced_as_a_whole_without_leaving_others(tmp_path: Path) -> None:
@@ -135,3 +131,155 @@ def test_a_link_that_somebody_has_made_beside_a_file_leads_nowhere(tmp_path: Pat
     (tmp_path / ".frames.dot.part").symlink_to(precious)
     write_file(path, b"digraph")
     assert (path.read_bytes(), precious.read_bytes()) == (b"digraph", b"precious")
+
+
+def test_a_pipe_has_room_for_any_line_unless_the_environment_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    assert terminal_width() is None
+    monkeypatch.setenv("COLUMNS", "60")
+    assert terminal_width() == 60
+    monkeypatch.setenv("COLUMNS", "many")
+    assert terminal_width() is None
+    monkeypatch.setattr(sys, "stdout", Terminal())
+    assert isinstance(terminal_width(), int)
+
+
+@pytest.mark.parametrize(("text", "width"), [("", 0), ("map", 3), ("雷达", 4), ("e\u0301", 1), ("Straße", 6)])
+def test_a_wide_letter_takes_two_columns_and_a_combining_mark_none(text: str, width: int) -> None:
+    assert cells(text) == width
+
+
+@pytest.mark.parametrize(
+    ("text", "width", "shortened"),
+    [
+        ("base_link", 9, "base_link"),
+        ("base_link", 8, "bas…link"),
+        ("base_link", 5, "ba…nk"),
+        ("base_link", 2, "…k"),
+        ("base_link", 1, "…"),
+        ("base_link", 0, ""),
+        ("雷达雷达", 7, "雷…雷达"),
+        ("雷达雷达", 5, "雷…达"),
+        ("雷达雷达", 4, "…达"),
+    ],
+)
+def test_the_middle_of_a_long_text_is_cut_out(text: str, width: int, shortened: str) -> None:
+    assert shorten(text, width) == shortened
+
+
+def test_a_line_is_broken_between_words_and_a_longer_word_is_shortened() -> None:
+    assert wrapped("one two three", None, 2) == wrapped("one two three", 13, 2) == ["one two three"]
+    assert wrapped("one two three", 8, 2) == ["one two", "  three"]
+    assert wrapped("at /a/very/long/path it is", 10, 2) == ["at", "  /a/…path", "  it is"]
+
+
+def test_the_widest_columns_give_way_first() -> None:
+    assert shorten_widest([20, 10, 3], 40) == [20, 10, 3]
+    assert shorten_widest([20, 10, 3], 28) == [15, 10, 3]
+    assert shorten_widest([20, 10, 3], 21) == [9, 9, 3]
+    assert shorten_widest([20, 10, 3], 5) == [8, 8, 3]
+    assert shorten_widest([], 5) == []
+
+
+COLUMNS = (Column("name"), Column("least", importance=1), Column("count", right=True, importance=2))
+ROWS = [("a", "xyz", "1"), ("long name", "w", "1,000")]
+
+
+def test_columns_are_as_wide_as_their_cells_and_numbers_stand_at_the_right() -> None:
+    assert list(table_lines(COLUMNS, ROWS, None)) == [
+        "name       least  count",
+        "a          xyz        1",
+        "long name  w      1,000",
+    ]
+    assert list(table_lines(COLUMNS, ROWS, 23)) == list(table_lines(COLUMNS, ROWS, None))
+
+
+def test_the_least_important_columns_go_first_where_they_do_not_fit() -> None:
+    assert list(table_lines(COLUMNS, ROWS, 22)) == ["name       count", "a              1", "long name  1,000"]
+    assert list(table_lines(COLUMNS, ROWS, 15)) == ["name", "a", "long name"]
+
+
+def test_columns_that_stay_always_are_shortened_but_to_eight_columns_at_least() -> None:
+    columns = (Column("name"), Column("kind"))
+    rows = [("left_shoulder_link", "fixed"), ("arm", "revolute")]
+    assert list(table_lines(columns, rows, 20)) == ["name        kind", "left…_link  fixed", "arm         revolute"]
+    assert list(table_lines(columns, rows, 3))[1] == "lef…link  fixed"
+
+
+def test_empty_columns_and_titles_are_left_out_and_wide_letters_take_two_columns() -> None:
+    assert list(table_lines(COLUMNS, [("a", "", "1")], None)) == ["name  count", "a         1"]
+    assert list(table_lines(COLUMNS, [], None, titles=False)) == []
+    assert list(table_lines(COLUMNS[::2], [("雷达", "1"), ("abcd", "2")], None, titles=False)) == ["雷达  1", "abcd  2"]
+
+
+def test_the_bar_is_on_standard_error_and_leaves_the_output_alone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    for item in track(iter("abc"), 3, "reading"):
+        print(item)
+        print("notice", file=sys.stderr)
+    assert capsys.readouterr().out == "a\nb\nc\n"
+    shown = terminal.getvalue()
+    assert "reading" in shown
+    assert shown.count("notice\n") == 3
+    # At its end, the bar erases its line.
+    assert shown.endswith("\x1b[2K")
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("command", "steps"),
+    [
+        (("info", str(SMALL)), ["reading"]),
+        (("query", str(SMALL), "map", "box", "--every", "0.001", "--json"), ["reading", "looking up"]),
+    ],
+)
+def test_on_a_terminal_a_command_prints_the_same_beside_its_bar(
+    tmp_path: Path, command: tuple[str, ...], steps: list[str]
+) -> None:
+    plain = subprocess.run([TFBUS, *command], capture_output=True, text=True, timeout=PATIENCE, check=True)
+    status, shown = on_a_terminal(tmp_path / "output", *command)
+    assert status == 0
+    assert (tmp_path / "output").read_text() == plain.stdout
+    for step in steps:
+        assert step in shown
+        assert step not in plain.stderr
+
+
+LOGGER = logging.getLogger("tfbus")
+
+
+def test_log_lines_of_one_kind_are_one_line_with_their_number(capsys: pytest.CaptureFixture[str]) -> None:
+    with log_lines("WARNING"):
+        for number in range(83):
+            LOGGER.warning("frame %r comes from two authorities", f"f{number}")
+        LOGGER.warning("the clock jumped back")
+    assert capsys.readouterr().err.splitlines() == [
+        "tfbus: frame 'f0' comes from two authorities (and 82 more like it)",
+        "tfbus: the clock jumped back",
+    ]
+
+
+def test_a_log_line_is_printed_when_its_time_is_over_and_the_time_doubles(capsys: pytest.CaptureFixture[str]) -> None:
+    times = []
+    with log_lines("WARNING", first_window=0.001):
+        for round_ in range(6):
+            began = time.monotonic()
+            LOGGER.warning("round %d", round_)
+            while not (printed := capsys.readouterr().err) and time.monotonic() < began + 60.0:
+                time.sleep(0.0001)
+            times.append(time.monotonic() - began)
+            assert printed == f"tfbus: round {round_}\n"
+    assert [spent >= 0.001 * 2**round_ for round_, spent in enumerate(times)] == [True] * 6
+
+
+def test_a_traceback_stays_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with log_lines("WARNING"):
+        LOGGER.warning("the callback raised", exc_info=ValueError("no\ntfbus: all is well\x1b[2J"))
+    first, *traceback = capsys.readouterr().err.split("\n")
+    assert first == "tfbus: the callback raised"
+    assert traceback[-3:] == ["  ValueError: no", r"  tfbus: all is well\x1b[2J", ""]
+    assert all(line.startswith("  ") for line in traceback[:-1])

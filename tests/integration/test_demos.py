@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from tfbus import SimulatedClock
-from tfbus.cli import tutorial
+from tfbus.cli.commands import tutorial
 from tfbus.testing import simulate
 
 DEMOS = Path(__file__).parents[2] / "demos"
@@ -52,7 +52,7 @@ def test_a_demo_that_is_tested_in_simulated_time_runs_as_a_script(demo: str, lin
 
 @pytest.mark.anyio
 async def test_the_script_prints_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
-    await tutorial.run(SimulatedClock(), duration=3.0)
+    await tutorial.run_robot(SimulatedClock(), duration=3.0)
     command = capsys.readouterr().out
 
     demo = load("robot_setup.py")

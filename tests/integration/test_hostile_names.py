@@ -40,7 +40,7 @@ from tfbus import (
 )
 from tfbus.analysis import Finding
 from tfbus.buffer.buffer import Buffer
-from tfbus.cli._overview import COMMANDS
+from tfbus.cli.application import COMMANDS
 from tfbus.recording import Recorder, load, load_static, save_static
 from tfbus.robot import Joint, RobotModel
 from tfbus.stamps import LATEST, Latest

@@ -10,7 +10,7 @@ from support.processes import free_address, new_domain, start_tfbus
 from support.recorded import SMALL
 from support.terminal import lines_on_a_terminal
 
-from tfbus.cli._width import cells
+from tfbus.cli.output import cells
 
 pytestmark = [pytest.mark.thorough, pytest.mark.parametrize("width", [60, 80, 120, 200])]
 

@@ -36,7 +36,7 @@ class Command:
     def __call__(self, *arguments: object) -> Done:
         """Run the command to its end."""
         # Loaded here, where the test is skipped if the extra is not installed.
-        from tfbus.cli.exit_status import run
+        from tfbus.cli.application import run
 
         try:
             status = run(list(map(str, arguments)))

@@ -1,4 +1,4 @@
-"""The command ``tfbus``, one subcommand a module in `tfbus.cli.commands`; the one that is called is loaded, no other.
+"""The command ``tfbus``; of its subcommands in `tfbus.cli.commands` only the one that is called is loaded.
 
 Standard output carries the result of a command; notices, warnings and errors go to standard error.
 """
@@ -22,7 +22,7 @@ def main() -> None:
 
     if heard:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from tfbus.cli.exit_status import run
+    from tfbus.cli.application import run
 
     try:
         status = run(sys.argv[1:], hear_ctrl_c)

@@ -1,36 +1,104 @@
-"""The command line in cyclopts: the subcommands, and the options of all of them."""
+"""The command line: the subcommands, the options of all of them, and the exit status for whatever happens.
 
-from collections.abc import Callable
+`run` parses the words with cyclopts, which loads the module of the one subcommand that they name; the help of all is a
+list of `COMMANDS`, and loads none. A subcommand returns its exit status, or None for success. It raises `UsageError`,
+a `RecordingError` or a `TransformLookupError` for what a user can cause, and `run` prints a line for each.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Sequence
 from functools import partial
+from io import TextIOWrapper
 from typing import Annotated, Literal
 
 try:
-    from cyclopts import App, Group, Parameter
+    from cyclopts import App, CycloptsError, Group, Parameter
 except ImportError:
     from tfbus.errors import pip_install
 
     raise SystemExit(f"tfbus: the command needs some packages more: {pip_install('cli')}") from None
 
-from tfbus.cli._overview import COMMANDS, EXIT_STATUSES, INSTALL_COMPLETION, SUMMARY
+FAILED, USAGE_ERROR, INTERRUPTED, ENDED_BY_SIGNAL = 1, 2, 130, 128
+"""The exit statuses; the number of a signal is added to the last one."""
 
-LogLevel = Literal["debug", "info", "warning", "error", "critical"]
-"""A level of the module `logging`."""
+COMMANDS = {
+    "bridge": "Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.",
+    "broadcast": "Broadcast the transform of the tutorial's laser, until Ctrl-C; tfbus listen in another terminal "
+    "receives it.",
+    "check": "Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.",
+    "compare": "Compare the trajectory of a frame in two recordings: absolute and relative pose error, aligned and "
+    "not.",
+    "convert": "Write recordings to a new one: in another format, a part of them, renamed, or several merged by their "
+    "log times.",
+    "demo": "Run the tutorial's robot: a 100 Hz broadcaster and a 1 Hz listener in one process, until Ctrl-C.",
+    "echo": "Print the transform of SOURCE in TARGET again and again, until Ctrl-C.",
+    "foxglove": "Show the frames of a domain to the Foxglove application, until Ctrl-C.",
+    "info": "Print the contents of a recording: its topics, its frames with parents, rates, gaps and delays, and its "
+    "senders.",
+    "listen": "Print a point of the tutorial's laser in the frame of the base, again and again, until Ctrl-C.",
+    "monitor": "Measure the rate, the delay, the jitter and the losses of each frame and sender of a domain, until "
+    "Ctrl-C.",
+    "play": "Publish a recording on a domain with its original stamps and timing, static transforms first.",
+    "plot": "Plot the transforms of some frames from a recording over time: FILE TARGET SOURCE...",
+    "query": "Print the transform of SOURCE in TARGET from a recording: the newest, at an instant, or at many.",
+    "record": "Record all transforms of a domain to FILE, in MCAP as ROS 2 and Foxglove read it, until Ctrl-C.",
+    "robot": "Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at "
+    "zero.",
+    "router": "Pass on what programs of all domains send each other, until Ctrl-C.",
+    "static": "Publish the static transform of CHILD in PARENT, or all that a file holds, until Ctrl-C.",
+    "tree": "Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.",
+    "view": "Show the frames of a domain, or of a recording, as a live 3D page in the browser, until Ctrl-C.",
+}
+"""The first line of the help of each subcommand, so that a list of them loads none."""
 
-Program = Callable[[], object]
+_MODULES = dict.fromkeys(("broadcast", "demo", "listen"), "tutorial")
+"""The module of a subcommand, where it is not the one of its name."""
+_SUMMARY = "Stamped coordinate transforms for asyncio and trio."
+_EXIT_STATUSES = (
+    "Exit status: 0 success; 1 a lookup or a recording has failed, or a check has found something; 2 wrong usage, or a "
+    "file that cannot be used; 130 ended by Ctrl-C; 143 ended by a termination. Variables of the environment: "
+    "TFBUS_DOMAIN, TFBUS_CONNECT (addresses with blanks between them), NO_COLOR."
+)
+
+_LogLevel = Literal["debug", "info", "warning", "error", "critical"]
+_Program = Callable[[], int | None]
 
 
-def _version() -> str:
-    # Loaded here, because most commands do without.
-    from importlib.metadata import version
+def run(words: Sequence[str], loaded: Callable[[], object] = lambda: None) -> int:
+    """Run the command with arguments, and return its exit status.
 
-    from tfbus.which_kernel import kernel
-
-    return f"{version('tfbus')} ({kernel} kernel)"
-
-
-def _shown_default(default: object) -> str | None:
-    """A default as the help shows it; None where the option changes nothing unless it is given."""
-    return None if default is None or default is False or default in ("", ()) else str(default)
+    Parameters
+    ----------
+    words : sequence of str
+        The words that a user types after ``tfbus``.
+    loaded : callable
+        Called once all modules of the subcommand are there, before it begins.
+    """
+    if isinstance(sys.stdout, TextIOWrapper):
+        # Its encoding may lack the letters of a frame name.
+        sys.stdout.reconfigure(errors="backslashreplace")
+    status = 0
+    try:
+        app = application(next((word for word in words if word in COMMANDS), None))
+        # Without a word, cyclopts would print the help as a program, for which more modules are loaded.
+        prepare, arguments, _ = app.meta.parse_args(words or ["--help"], exit_on_error=False, print_error=False)
+        program = prepare(*arguments.args, **arguments.kwargs)
+        # Help has been printed by now.
+        if program is not None:
+            loaded()
+            status = program() or 0
+        sys.stdout.flush()
+    except* KeyboardInterrupt:
+        status = INTERRUPTED
+    except* BrokenPipeError:
+        # The reader has closed the pipe; without this, Python would report that again when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except* _usage_errors() as errors:
+        status = _report(errors, USAGE_ERROR)
+    except* _lookup_errors() as errors:
+        status = _report(errors, FAILED)
+    return status
 
 
 def application(command: str | None) -> App:
@@ -43,23 +111,24 @@ def application(command: str | None) -> App:
     """
     app = App(
         name="tfbus",
-        help=SUMMARY,
+        help=_SUMMARY,
         version=_version,
-        help_epilogue=EXIT_STATUSES,
+        help_epilogue=_EXIT_STATUSES,
         # To load a parser of Markdown takes as long as all the rest of the list of commands.
         help_format="plaintext" if command is None else "markdown",
         suppress_keyboard_interrupt=False,
         default_parameter=Parameter(negative_iterable="", show_default=_shown_default),
     )
     for name, summary in COMMANDS.items():
-        app.command(f"tfbus.cli.commands.{name}:{name}", name=name, help=None if name == command else summary)
-    app.register_install_completion_command(help=INSTALL_COMPLETION)
+        path = f"tfbus.cli.commands.{_MODULES.get(name, name)}:{name}"
+        app.command(path, name=name, help=None if name == command else summary)
+    app.register_install_completion_command(help="Install completion for the shell that is in use, and exit.")
 
     @app.meta.default
     def prepare(
         *words: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
-        log_level: Annotated[LogLevel, Parameter(group=Group("Options of all commands", sort_key=9))] = "warning",
-    ) -> Program:
+        log_level: Annotated[_LogLevel, Parameter(group=Group("Options of all commands", sort_key=9))] = "warning",
+    ) -> _Program:
         """Parse the command line.
 
         Parameters
@@ -73,8 +142,45 @@ def application(command: str | None) -> App:
     return app
 
 
-def _run_logging(level: LogLevel, program: Program) -> None:
-    from tfbus.cli._log_lines import log_lines
+def _shown_default(default: object) -> str | None:
+    """A default as the help shows it; None where the option changes nothing unless it is given."""
+    return None if default is None or default is False or default in ("", ()) else str(default)
+
+
+# These are loaded where they are used: the help and the version do without most of them.
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    from tfbus.which_kernel import kernel
+
+    return f"{version('tfbus')} ({kernel} kernel)"
+
+
+def _run_logging(level: _LogLevel, program: _Program) -> int | None:
+    from tfbus.cli.output import log_lines
 
     with log_lines(level.upper()):
-        program()
+        return program()
+
+
+def _report(errors: BaseExceptionGroup[BaseException], status: int) -> int:
+    from tfbus.cli.output import warn
+
+    for error in errors.exceptions:
+        warn(str(error))
+    return status
+
+
+def _usage_errors() -> tuple[type[Exception], ...]:
+    from tfbus.cli.arguments import UsageError
+    from tfbus.errors import RecordingError
+
+    return CycloptsError, UsageError, RecordingError
+
+
+def _lookup_errors() -> type[Exception]:
+    from tfbus.errors import TransformLookupError
+
+    return TransformLookupError

@@ -1,18 +1,15 @@
-"""The argument types of the subcommands."""
+"""The types of the arguments of the subcommands, and the error for an argument that cannot be used."""
 
 import calendar
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
-from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from cyclopts import Parameter, Token
 from cyclopts.validators import Number
 
-from tfbus.recording.recording import Recording, open_recording
 from tfbus.stamps import SECOND, STAMP_MAX
 
 _LIMIT = Decimal(STAMP_MAX // SECOND)
@@ -128,51 +125,3 @@ JsonFlag = Annotated[Flag, Parameter(name="--json")]
 """The flag ``--json``."""
 CsvFlag = Annotated[Flag, Parameter(name="--csv")]
 """The flag ``--csv``."""
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, slots=True)
-class TopicOptions:
-    """The options of a command that reads a recording.
-
-    Parameters
-    ----------
-    topic
-        Read this topic in place of /tf and /tf_static; with =PREFIX behind it, such as /robot1/tf=robot1/, put a prefix
-        before the names of its frames. May be given several times.
-    namespaces
-        Read tf and tf_static of all namespaces; the frames of /robot1/tf get the prefix robot1/.
-    prefix
-        Put this before the names of all frames.
-    """
-
-    topic: tuple[str, ...] = ()
-    namespaces: Flag = False
-    prefix: str = ""
-
-    def open(self, file: Path) -> Recording:
-        """Open a recording.
-
-        Raises
-        ------
-        UsageError
-            If the options contradict each other.
-        RecordingError
-            As `open_recording`.
-        """
-        return open_recording(file, **self.arguments())
-
-    def arguments(self) -> dict[str, Any]:
-        """The options as arguments of `open_recording`; raises `UsageError` if they contradict each other."""
-        if self.topic and self.namespaces:
-            raise UsageError("--topic and --namespaces are two ways to choose: give one of them")
-        pairs = [topic.partition("=") for topic in self.topic]
-        for prefix in (self.prefix, *(prefix for _, _, prefix in pairs)):
-            if prefix.startswith("/"):
-                raise UsageError(f"a prefix must not start with '/', got {prefix!r}")
-        topics = {name: prefix for name, _, prefix in pairs} or None
-        return {"topics": topics, "prefix": self.prefix, "namespaces": self.namespaces}
-
-
-DEFAULT_TOPICS = TopicOptions()
-"""The options of a command line that gives none."""

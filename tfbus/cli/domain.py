@@ -1,26 +1,43 @@
-"""Joining a domain: the options that say how, and the program that runs on the joined bus."""
+"""Joining a domain, or ROS: the options that say how, and the program that runs on the joined bus.
+
+`LinkOptions` are the options of every command that joins; `LinkOptions.run` makes a bus, links it to the domain or by
+`ros_link` to the places of ROS, and has `run` run the program on it in an event loop that ends in order at Ctrl-C. The
+bus of a command that shows times has a `ReplayClock`, which follows the time that a replay tells the domain.
+"""
 
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable
+import re
+import signal
+import sys
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import Annotated, Protocol, TypeVar
+from typing import Annotated, Any, Final, Protocol, TypeVar
 
 import anyio
+import anyio.lowlevel
+from anyio.abc import TaskStatus
 from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
-from tfbus.cli._event_loop import run
-from tfbus.cli._replay_clock import ReplayClock
-from tfbus.cli._ros import ros_link
 from tfbus.cli.arguments import Backend, UsageError
-from tfbus.cli.output import say
-from tfbus.clock import Clock, SimulatedClock
-from tfbus.errors import pip_install
+from tfbus.cli.output import say, warn
+from tfbus.clock import Clock, JumpCallback, SimulatedClock, SystemClock
+from tfbus.errors import ClockResetError, InvalidTransformError, pip_install
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.registration import Registration
+from tfbus.stamps import SECOND, as_stamp
 
 T = TypeVar("T")
 
+_PATIENCE: Final = 5.0
+"""s. The transforms of a simulation often arrive before its clock, which would show them as decades old."""
+_DDS = re.compile(r"dds(?::(\d{1,3}))?")
+_ZENOH = re.compile(r"zenoh:(.+:\d+)")
+_WEBSOCKET = re.compile(r"wss?://.*")
+_RETRY = 1.0
+"""The time between two attempts, in s."""
 _SILENCE_BEFORE_NOTICE = 1.0
 """s."""
 _NO_ZENOH = f"joining a domain needs a package more: {pip_install('cli,zenoh')}"
@@ -194,3 +211,168 @@ class LinkOptions:
 
 DEFAULT_LINK = LinkOptions()
 """The options of a command line that gives none."""
+
+
+def run(main: Callable[[], Awaitable[T]], backend: str) -> T:
+    """Run an async function as `anyio.run` does; Ctrl-C cancels it, and its cleanup survives further presses.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After the function has ended, if Ctrl-C was pressed.
+    """
+    # A handler that is not Python's own stays: a shell, for example, has background programs ignore the signal.
+    if sys.platform == "win32" or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        return anyio.run(main, backend=backend)
+    interrupted = False
+    failure: Exception | None = None
+    result: T
+
+    async def run_until_interrupted() -> None:
+        nonlocal interrupted
+        with anyio.open_signal_receiver(signal.SIGINT) as presses:
+            async with anyio.create_task_group() as tasks:
+
+                async def work() -> None:
+                    nonlocal failure, result
+                    try:
+                        result = await main()
+                    except Exception as error:  # noqa: BLE001 - the task group would wrap it in an ExceptionGroup
+                        failure = error
+                    tasks.cancel_scope.cancel()
+
+                tasks.start_soon(work)
+                async for _ in presses:
+                    interrupted = True
+                    tasks.cancel_scope.cancel()
+
+    anyio.run(run_until_interrupted, backend=backend)
+    if failure is not None:
+        raise failure
+    if interrupted:
+        raise KeyboardInterrupt
+    return result
+
+
+class ReplayClock(SystemClock):
+    """The time of the machine until the first stamp is heard, and then the newest stamp that was heard.
+
+    So the ages of transforms are ages of then. Durations, rates and timeouts stay those of the machine: a command goes
+    on while the replay is paused.
+    """
+
+    def __init__(self) -> None:
+        self._told: int | None = None
+        self._patient_until = time.monotonic() + _PATIENCE
+        self._heard = anyio.Event()
+        self._callbacks: dict[object, JumpCallback] = {}
+
+    @property
+    def is_set(self) -> bool:
+        """Whether a stamp was heard, or none has come for so long that the time is the machine's."""
+        return self._told is not None or time.monotonic() >= self._patient_until
+
+    def now(self) -> int:
+        """The newest stamp that was heard, or the machine's time; in ns."""
+        return super().now() if self._told is None else self._told
+
+    def hear(self, stamp: int) -> None:
+        """Take the time of the replay, in ns; an earlier one is a jump back.
+
+        The first one is another clock's, so that it is no earlier or later time: it is told as a jump to itself, and
+        what has arrived before it stays.
+        """
+        before = stamp if self._told is None else self._told
+        first, self._told = self._told is None, stamp
+        heard, self._heard = self._heard, anyio.Event()
+        heard.set()
+        if first or stamp < before:
+            for callback in tuple(self._callbacks.values()):
+                callback(before, stamp)
+
+    async def sleep_until(self, stamp: int) -> None:
+        """Sleep until a stamp in ns; `ClockResetError` after a jump back."""
+        wanted, before = as_stamp(stamp), self.now()
+        await anyio.lowlevel.checkpoint()
+        while (now := self.now()) < wanted:
+            if now < before:
+                raise ClockResetError(before=before, after=now)
+            before = now
+            with anyio.move_on_after((wanted - now) / SECOND if self._told is None else None):
+                await self._heard.wait()
+
+    def on_jump(self, callback: JumpCallback) -> Registration:
+        """Call `callback` with the stamps before and after each jump."""
+        key = object()
+        self._callbacks[key] = callback
+        return Registration(lambda: self._callbacks.pop(key, None))
+
+
+def is_ros(place: str) -> bool:
+    """Whether a place is one of ROS rather than a domain."""
+    return any(kind.fullmatch(place) for kind in (_DDS, _ZENOH, _WEBSOCKET))
+
+
+def ros_link(bus: Bus, place: str, **options: Any) -> AbstractAsyncContextManager[object]:
+    """The link to a place: ``dds``, ``dds:42``, ``zenoh:host:7447`` or ``ws://host:9090``.
+
+    Parameters
+    ----------
+    bus : Bus
+    place : str
+    **options
+        The options that all links to ROS share.
+
+    Raises
+    ------
+    UsageError
+        If it is none of these, or an extra is missing.
+    """
+    try:
+        if found := _DDS.fullmatch(place):
+            from tfbus.links.dds import DdsLink
+
+            return DdsLink(bus, None if found[1] is None else int(found[1]), **options)
+        if found := _ZENOH.fullmatch(place):
+            from tfbus.links.rmw_zenoh import RmwZenohLink
+
+            return RmwZenohLink(bus, f"tcp/{found[1]}", **options)
+        if _WEBSOCKET.fullmatch(place):
+            from tfbus.links.rosbridge import RosbridgeLink
+
+            return RosbridgeLink(bus, place, **options)
+    except (ImportError, ValueError) as error:
+        raise UsageError(str(error)) from None
+    raise UsageError(
+        f"{place!r} is no place of ROS: write dds, dds:42 for ROS_DOMAIN_ID 42, zenoh:host:7447, or ws://host:9090"
+    )
+
+
+async def publish_static(
+    bus: Bus, samples: Sequence[TransformStamped], *, task_status: TaskStatus[None] = anyio.TASK_STATUS_IGNORED
+) -> None:
+    """Publish static samples; one that the bus refuses is shown once, and tried again until it is accepted.
+
+    A refused sample may close a loop with an edge of another program, which may end. As a task it has started once
+    each sample has been tried.
+    """
+    warned: set[str] = set()
+    pending = _publish_each(bus, samples, warned)
+    task_status.started()
+    while pending:
+        await bus.clock.sleep(_RETRY)
+        pending = _publish_each(bus, pending, warned)
+
+
+def _publish_each(bus: Bus, samples: Sequence[TransformStamped], warned: set[str]) -> list[TransformStamped]:
+    """Publish samples one by one, and return the samples that the bus refused."""
+    refused = []
+    for sample in samples:
+        try:
+            bus.publish(sample)
+        except InvalidTransformError as error:
+            refused.append(sample)
+            if sample.child not in warned:
+                warned.add(sample.child)
+                warn(f"refused, and tried again once a second: {error}")
+    return refused

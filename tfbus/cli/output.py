@@ -1,19 +1,38 @@
-"""The output of the subcommands: results, notices, warnings, and values as text for people."""
+"""The output of the subcommands: lines, tables, progress, values as text for people, files and log lines.
+
+Results go to standard output, all else to standard error. On a terminal a line of the result is at most as wide as it:
+`fitted` and `wrapped` break texts between words, `table_lines` leaves out columns, `shorten` cuts the middle of a name
+out. A pipe has room for any line. Names are escaped by `tfbus.plain.printable` before they are measured.
+"""
 
 import csv
+import logging
+import os
+import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import textwrap
+import threading
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import UsageError
 from tfbus.geometry.transform import Transform
 from tfbus.plain import printable
-from tfbus.stamps import SECOND
+from tfbus.stamps import SECOND, format_duration, from_seconds
 
 ItemT = TypeVar("ItemT")
+
+_ELLIPSIS = "…"
+_STEP = 4
+"""The width of the guides of one level of a tree."""
+_GAP = "  "
+"""The blanks between two columns of a table."""
+_FIRST_WINDOW = 0.3
+"""The time in s for which the first log line of a kind is held back, to count the lines that follow."""
+_LONGEST_WINDOW = 10.0
 
 
 def print_now(line: str) -> None:
@@ -21,9 +40,9 @@ def print_now(line: str) -> None:
     print(line, flush=True)
 
 
-def fitted(line: str) -> str:
+def fitted(line: str, indent: int = 2) -> str:
     """A line of the result, broken between words where it is longer than the terminal is wide."""
-    return "\n".join(wrapped(line, terminal_width(), 2))
+    return "\n".join(wrapped(line, terminal_width(), indent))
 
 
 def say(line: str) -> None:
@@ -36,25 +55,164 @@ def warn(message: str) -> None:
     say(f"tfbus: {message}")
 
 
+def terminal_width() -> int | None:
+    """The greatest length of a line on standard output; None where it is no terminal, which has room for any line.
+
+    The variable ``COLUMNS`` of the environment decides, if it is set.
+    """
+    if not sys.stdout.isatty() and not os.environ.get("COLUMNS", "").isdecimal():
+        return None
+    return shutil.get_terminal_size((80, 24)).columns
+
+
+def cells(text: str) -> int:
+    """The number of columns that a text takes on a terminal: two for a wide letter, none for a combining mark."""
+    if text.isascii():
+        return len(text)
+    return sum(
+        2 if unicodedata.east_asian_width(letter) in "WF" else int(not unicodedata.combining(letter)) for letter in text
+    )
+
+
+def shorten(text: str, width: int) -> str:
+    """Cut the middle of a text out, where it is longer than `width`: both ends of a name tell it from others."""
+    if cells(text) <= width:
+        return text
+    if width <= 1:
+        return _ELLIPSIS[:width]
+    head, tail = "", ""
+    room = width - 1
+    start, end = 0, len(text)
+    while start < end:
+        from_tail = cells(tail) <= cells(head)
+        letter = text[end - 1] if from_tail else text[start]
+        if cells(head) + cells(tail) + cells(letter) > room:
+            break
+        if from_tail:
+            tail, end = letter + tail, end - 1
+        else:
+            head, start = head + letter, start + 1
+    return f"{head}{_ELLIPSIS}{tail}"
+
+
+def wrapped(text: str, width: int | None, indent: int) -> list[str]:
+    """The lines of a text that is broken between words, all but the first indented; a longer word is shortened.
+
+    Control characters in names are escaped first: no name begins a line.
+    """
+    text = printable(text)
+    if width is None or cells(text) <= width:
+        return [text]
+    room = max(1, width - indent)
+    words = [shorten(word, room) if word else word for word in text.split(" ")]
+    return textwrap.wrap(
+        " ".join(words), width, subsequent_indent=" " * indent, break_long_words=True, break_on_hyphens=False
+    )
+
+
+def align(text: str, width: int, right: bool = False) -> str:
+    """Fill a text with blanks up to a width."""
+    blanks = " " * (width - cells(text))
+    return blanks + text if right else text + blanks
+
+
+def shorten_widest(widths: Sequence[int], room: int, least: int = 8) -> list[int]:
+    """The widths of columns, the widest made narrower until all fit `room`, none below `least` unless it is already."""
+    fitted = list(widths)
+    while sum(fitted) > room and max(fitted, default=0) > least:
+        fitted[fitted.index(max(fitted))] -= 1
+    return fitted
+
+
+def narrow_guides(guides: str, step: int) -> str:
+    """The lines before a frame in a drawn tree with 1, 2 or all 4 columns a level."""
+    if step == _STEP:
+        return guides
+    return "".join(guides[at : at + step].replace("─", " ") for at in range(0, len(guides), _STEP))
+
+
+class Column(NamedTuple):
+    """A column of a table.
+
+    Parameters
+    ----------
+    title : str
+    right : bool
+        Whether its cells stand at the right.
+    importance : int or None
+        Where the table is too wide, the column with the lowest number goes first; None stays always.
+    """
+
+    title: str
+    right: bool = False
+    importance: int | None = None
+
+
+def table_lines(
+    columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int | None, titles: bool = True
+) -> Iterator[str]:
+    """The lines of a table, its titles first; empty columns are left out.
+
+    Parameters
+    ----------
+    columns : sequence of Column
+    rows : sequence of sequence of str
+        The cells of each row; names need not be printable.
+    width : int, optional
+        The greatest length of a line; where columns that stay always do not fit, their longest cells are shortened.
+    titles : bool
+        Whether the first line has the titles.
+    """
+    rows = [list(map(printable, row)) for row in rows]
+    shown = [at for at in range(len(columns)) if any(row[at] for row in rows)]
+    lines = [[column.title for column in columns], *rows] if titles else list(rows)
+    widths = [max(cells(line[at]) for line in lines) for at in range(len(columns))] if rows else []
+
+    def room() -> int:
+        return sum(widths) if width is None else width - len(_GAP) * (len(shown) - 1)
+
+    while sum(widths[at] for at in shown) > room():
+        optional = [at for at in shown if columns[at].importance is not None]
+        if not optional:
+            break
+        shown.remove(min(optional, key=lambda at: columns[at].importance or 0))
+    fitted = dict(zip(shown, shorten_widest([widths[at] for at in shown], room()), strict=True))
+    for line in lines:
+        yield _GAP.join(align(shorten(line[at], fitted[at]), fitted[at], columns[at].right) for at in shown).rstrip()
+
+
+@contextmanager
+def progress_bar() -> Iterator[Any]:
+    """A `rich.progress.Progress` on standard error for the body of a ``with``; it disappears and moves no other output.
+
+    Use it only if standard error is a terminal.
+    """
+    # Loaded for a terminal only.
+    from rich.console import Console
+    from rich.progress import Progress
+
+    # With its redirection, rich would print results that go to standard output on standard error.
+    with Progress(console=Console(stderr=True), transient=True, redirect_stdout=False, redirect_stderr=False) as bar:
+        yield bar
+
+
+@contextmanager
+def progress(total: int | None, description: str) -> Iterator[Callable[[int], object]]:
+    """Show a progress bar for the body of a ``with``, if standard error is a terminal; yields how to advance."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    with progress_bar() as bar:
+        task = bar.add_task(description, total=total)
+        yield lambda count: bar.advance(task, count)
+
+
 def track(items: Iterable[ItemT], total: int | None, description: str) -> Iterator[ItemT]:
     """Iterate over the items with a progress bar, if standard error is a terminal."""
     with progress(total, description) as advance:
         for item in items:
             yield item
             advance(1)
-
-
-@contextmanager
-def progress(total: int | None, description: str) -> Iterator[Callable[[int], object]]:
-    """Show a progress bar for the body of a ``with``, if standard error is a terminal; gives what advances it."""
-    if not sys.stderr.isatty():
-        yield lambda _: None
-        return
-    from tfbus.cli._progress_bar import progress_bar
-
-    with progress_bar() as bar:
-        task = bar.add_task(description, total=total)
-        yield lambda count: bar.advance(task, count)
 
 
 class _Rows:
@@ -93,6 +251,11 @@ def format_transform(transform: Transform) -> str:
     return f"xyz {format_numbers(transform.translation)} m, rpy {format_numbers(transform.as_rpy())} rad"
 
 
+def format_span(seconds: float | None) -> str:
+    """A duration in s for people, such as ``20 ms``; empty if it is not known."""
+    return "" if seconds is None else format_duration(from_seconds(seconds))
+
+
 def format_counts(counts: Mapping[str, int]) -> str:
     """Counts by reason in one line: ``3 x not finite, 1 x cycle``."""
     return ", ".join(f"{count:,} x {reason}" for reason, count in counts.items())
@@ -115,3 +278,76 @@ def write_file(path: Path, content: bytes) -> None:
             written.write_bytes(content)
     except OSError as error:
         raise UsageError(f"cannot write {path}: {error.strerror}") from None
+
+
+@contextmanager
+def log_lines(level: str, first_window: float = _FIRST_WINDOW) -> Iterator[None]:
+    """Show what tfbus logs at a level, or at a higher one, on standard error for the body of a ``with``.
+
+    Parameters
+    ----------
+    level : str
+    first_window : float
+        The time in s for which the first line of a kind is held back, to count the lines that follow.
+    """
+    logger = logging.getLogger("tfbus")
+    handler = _FoldingHandler(first_window)
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+        logger.removeHandler(handler)
+        handler.close()
+
+
+class _FoldingHandler(logging.Handler):
+    """Prints the first line of a kind with the number of lines that follow within a short time.
+
+    Lines are of one kind if they differ only in their arguments. The time doubles each time that a kind comes again, up
+    to `_LONGEST_WINDOW`, and nothing is lost: `close` prints what is still held back.
+    """
+
+    def __init__(self, first_window: float) -> None:
+        super().__init__()
+        self._first_window = first_window
+        self._held: dict[str, tuple[str, int, threading.Timer]] = {}
+        self._windows: dict[str, float] = {}
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Hold a line back, or count it to the one of its kind that is held back."""
+        kind = str(record.msg)
+        if kind in self._held:
+            line, more, timer = self._held[kind]
+            self._held[kind] = (line, more + 1, timer)
+            return
+        window = self._windows.get(kind, self._first_window)
+        self._windows[kind] = min(2 * window, _LONGEST_WINDOW)
+        timer = threading.Timer(window, self._tell, (kind,))
+        timer.daemon = True
+        self._held[kind] = (self.format(record), 0, timer)
+        timer.start()
+
+    def close(self) -> None:
+        """Print all lines that are held back."""
+        for kind, (_, _, timer) in list(self._held.items()):
+            timer.cancel()
+            self._tell(kind)
+        super().close()
+
+    def _tell(self, kind: str) -> None:
+        # A timer calls it in its own thread.
+        self.acquire()
+        try:
+            held = self._held.pop(kind, None)
+        finally:
+            self.release()
+        if held is not None:
+            line, more, _ = held
+            # Only a traceback has several lines. No message in it begins a line as those of tfbus do.
+            first, *traceback = line.split("\n")
+            warn(f"{first} (and {more:,} more like it)" if more else first)
+            for part in traceback:
+                say(f"  {part}")

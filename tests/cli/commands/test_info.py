@@ -88,18 +88,6 @@ def test_names_are_no_markup_and_not_cut_where_the_output_is_no_terminal(tmp_pat
     assert rows[long][0] == ":robot:"
 
 
-def test_names_cannot_control_the_terminal(tmp_path: Path, tfbus: Command) -> None:
-    samples = [moving("\x1b[2Jroot", "red\x1b[31m\nhot", 1), moving("red\x1b[31m\nhot", "leaf", 1)]
-    metadata = {"tfbus.authorities": json.dumps([["\x1b]0;title\x07", 1]])}
-    done = tfbus("info", write_mcap(tmp_path / "run.mcap", [(1, "/tf", samples)], metadata=metadata), "--wide")
-    assert "\x1b" not in done.stdout
-    assert r"frames    2, below \x1b[2Jroot" in done.stdout
-    rows = rows_of(done.stdout)
-    assert rows[r"red\x1b[31m\nhot"][0] == r"\x1b[2Jroot"
-    assert rows["leaf"][0] == r"red\x1b[31m\nhot"
-    assert rows["leaf"][-1] == r"\x1b]0;title\x07"
-
-
 def test_no_line_ends_with_blanks(tfbus: Command) -> None:
     assert all(line == line.rstrip() for line in tfbus("info", SMALL, "--wide").stdout.splitlines())
 
@@ -146,8 +134,8 @@ def test_a_file_that_is_no_recording_is_one_line_and_status_2(
     path = tmp_path / "run.mcap"
     if content is not None:
         path.write_bytes(content)
-    done = tfbus("info", path)
-    check_wrong_call(done, f"recording '{path}': {why}")
+    for words in (("info", path), ("query", path, "a", "b"), ("play", path)):
+        check_wrong_call(tfbus(*words), f"recording '{path}': {why}")
 
 
 def test_all_lines_fit_80_columns_and_what_matters_least_is_left_out(

@@ -1,28 +1,32 @@
+"""``tfbus play``."""
+
 import os
 import re
 import signal
 import sys
-from collections import Counter
-from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Sequence
-from contextlib import aclosing, contextmanager, nullcontext
+import termios
+import time
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
 import anyio
 import pytest
 from support.commands import Command, Done, check_wrong_call, nobody
-from support.processes import free_address, new_domain, start_tfbus
+from support.processes import TFBUS, free_address, new_domain, start_tfbus, until
 from support.recorded import SMALL, WRONG_IN_SMALL, messages_in, write_mcap
 from support.samples import moving, static
-from support.terminal import Terminal, on_a_terminal
+from support.terminal import Terminal
 
 from tfbus import SECOND, Bus, PeerJoined, SystemClock, TransformStamped
-from tfbus.cli._keyboard import Keyboard
-from tfbus.cli.commands import play as play_module
-from tfbus.cli.commands.play import _print_summary, _show_progress, _steer, press
+from tfbus.cli.commands.play import Keyboard, keyboard, press
 from tfbus.recording import Player
 
 START = 1_700_000_000 * SECOND
+pty = pytest.importorskip("pty", reason="this system has no pseudo-terminals")
+_LIMIT = 60.0
+Then = Callable[[list[TransformStamped]], Awaitable[object]]
 BACKENDS = ["asyncio", "trio"]
 
 
@@ -34,12 +38,25 @@ def ten_seconds(tmp_path: Path) -> Path:
     return write_mcap(tmp_path / "ten_seconds.mcap", lines, metadata={"tfbus.authorities": '[["odometry", 1]]'})
 
 
+@pytest.fixture
+def hour(tmp_path: Path) -> Path:
+    """A message at the beginning, two after an hour, and one more after two."""
+    times = (0, 3_600, 3_601, 7_200)
+    return write_mcap(
+        tmp_path / "hour.mcap", [(k * SECOND, "/tf", [moving("map", "base", k * SECOND, float(k))]) for k in times]
+    )
+
+
 def samples_in(path: Path) -> list[TransformStamped]:
     return [sample for message in messages_in(path) for sample in message.batch]
 
 
-def play(tfbus: Command, *arguments: object) -> tuple[Done, list[TransformStamped]]:
-    """Play to a peer that is found at once; the samples are those that it receives."""
+async def listen_forever(_: list[TransformStamped]) -> None:
+    await anyio.sleep_forever()
+
+
+def play(tfbus: Command, *arguments: object, then: Then = listen_forever) -> tuple[Done, list[TransformStamped]]:
+    """Play to a peer that is found at once, until `then` ends; the samples are those that it receives."""
     received: list[TransformStamped] = []
 
     async def listen(bus: Bus) -> None:
@@ -47,7 +64,7 @@ def play(tfbus: Command, *arguments: object) -> tuple[Done, list[TransformStampe
             await anyio.wait_all_tasks_blocked()
             assert received == [], "played before a peer was found"
             bus._announce(PeerJoined(bus.clock.now(), "tf", "peer"))
-            await anyio.sleep_forever()
+            await then(received)
 
     return tfbus.on_domain(listen, "play", *arguments, clock=SystemClock()), received
 
@@ -192,164 +209,246 @@ def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
     check_wrong_call(tfbus("play", ten_seconds, *arguments), why)
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no recording", b"\x89MCAP0\r\n", b"\x89MC"])
-def test_a_file_that_is_no_recording_is_one_line_and_status_2(
-    tmp_path: Path, content: bytes | None, tfbus: Command
+@pytest.mark.anyio
+@pytest.mark.parametrize(
+    ("keys", "rate", "after", "paused"),
+    [
+        (" ", 1.0, 1.0, True),
+        ("  ", 1.0, 1.0, False),
+        ("x", 1.0, 1.0, False),
+        ("++", 1.0, 5.0, False),
+        ("=", 2.0, 5.0, False),
+        ("+-", 3.0, 2.0, False),
+        ("--", 1.0, 0.2, False),
+        # From a hundredth to five hundred times as fast.
+        ("-", 0.01, 0.01, False),
+        ("+", 500.0, 500.0, False),
+        ("+", 0.001, 0.01, False),
+        ("-", 1_000.0, 500.0, False),
+    ],
+)
+async def test_keys_pause_and_change_the_rate_in_steps(keys: str, rate: float, after: float, paused: bool) -> None:
+    player = Player(Bus(), "run.mcap", rate=rate)
+    for key in keys:
+        press(player, key)
+    assert player.rate == pytest.approx(after)
+    assert player.paused is paused
+
+
+def heard(received: Sequence[object], count: int) -> bool:
+    return len(received) == count
+
+
+@contextmanager
+def typewriter(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
+    """A terminal as standard input, in whose foreground this process runs; gives its two ends."""
+    ours, theirs = pty.openpty()
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
+    with os.fdopen(theirs, encoding="utf-8") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        yield ours, theirs
+    os.close(ours)
+
+
+@pytest.mark.parametrize("screen", [False, True])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_keys_steer_the_player_until_a_termination_and_the_terminal_is_as_before(
+    tfbus: Command, hour: Path, monkeypatch: pytest.MonkeyPatch, backend: str, screen: bool
 ) -> None:
-    path = tmp_path / "run.mcap"
-    if content is not None:
-        path.write_bytes(content)
-    check_wrong_call(tfbus("play", path), f"recording '{path}': ")
+    shown = Terminal()
+    if screen:
+        monkeypatch.setattr(sys, "stderr", shown)
+        monkeypatch.setenv("TERM", "xterm")
+    with typewriter(monkeypatch) as (ours, theirs):
+        before = termios.tcgetattr(theirs)
+        raw = before[3] & ~(termios.ICANON | termios.ECHO)
+        while_stopped: list[object] = []
+        kill = os.kill
+
+        def stop_or_kill(process: int, number: int) -> None:
+            if number == signal.SIGSTOP:
+                while_stopped.append(termios.tcgetattr(theirs))
+            else:
+                kill(process, number)
+
+        monkeypatch.setattr(os, "kill", stop_or_kill)
+
+        async def type_keys(received: list[TransformStamped]) -> None:
+            for count, keys in enumerate((b" +s", b"\x1b[C"), 1):
+                await until(partial(heard, received, count))
+                os.write(ours, keys)
+            await until(partial(heard, received, 3))
+            # The bar is drawn ten times a second.
+            await until(lambda: not screen or "paused at 2 x" in shown.getvalue())
+            os.kill(os.getpid(), signal.SIGTSTP)
+            await until(lambda: len(while_stopped) == 1)
+            await until(lambda: termios.tcgetattr(theirs)[3] == raw)
+            os.kill(os.getpid(), signal.SIGTERM)
+            await anyio.sleep_forever()
+
+        done, _ = play(tfbus, hour, "--backend", backend, then=type_keys)
+        assert [*while_stopped, termios.tcgetattr(theirs)] == [before, before]
+    lines = (shown.getvalue() if screen else done.stderr).splitlines()
+    assert done.returncode == 128 + signal.SIGTERM
+    assert any(line.startswith("space pauses, s or the right arrow plays the next message") for line in lines)
+    assert "3 samples in 3 messages played in " in lines[-1]
+    if screen:
+        assert "50%" in shown.getvalue()
+    else:
+        assert lines[2:-1][:3] == ["paused", "paused at 2 x", "paused at 2 x"]
+
+
+def test_a_loop_counts_its_passes(tfbus: Command, ten_seconds: Path) -> None:
+    async def three_times(received: list[TransformStamped]) -> None:
+        await until(lambda: sum(sample.static for sample in received) >= 3)
+
+    done, _ = play(tfbus, ten_seconds, "--loop", "--rate", "inf", then=three_times)
+    assert done.returncode == 130
+    assert re.search(r"\d samples in [\d,]+ messages played in \d\.\d s, \d+ times to the end$", done.stderr)
+
+
+def test_there_is_no_keyboard_but_a_terminal_in_whose_foreground_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    with typewriter(monkeypatch) as (_, theirs):
+        assert keyboard() is not None
+        monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
+        assert keyboard() is None
+        before = termios.tcgetattr(theirs)
+        with Keyboard(theirs):
+            assert termios.tcgetattr(theirs) == before
+    with Path(os.devnull).open(encoding="utf-8") as nothing:
+        for stdin in (nothing, None):
+            monkeypatch.setattr(sys, "stdin", stdin)
+            assert keyboard() is None
+
+
+@pytest.mark.anyio
+async def test_letters_and_arrows_are_told_apart_until_the_terminal_is_closed() -> None:
+    terminal, typist = os.pipe()
+    os.write(typist, b"s \x1b[C\x1b[A\x1b[B\x1b[D+\x1b\xff")
+    os.close(typist)
+    keys = [key async for key in Keyboard(terminal).keys()]  # noqa: SIM118 - it is no mapping
+    os.close(terminal)
+    assert keys == ["s", " ", "right", "up", "down", "left", "+", "\x1b", "\xff"]
+
+
+class Session:
+    """``tfbus play`` as the foreground program of a terminal of its own."""
+
+    def __init__(self, process: int, terminal: int, before: list[object]) -> None:
+        self.process = process
+        self.terminal = terminal
+        self.before = before
+        self.shown = ""
+
+    def expect(self, text: str) -> None:
+        """Read until a text is shown behind all that was expected before."""
+        deadline = time.monotonic() + _LIMIT
+        while text not in self.shown:
+            assert time.monotonic() < deadline, self.shown[-300:]
+            with suppress(OSError):
+                self.shown += os.read(self.terminal, 4_096).decode()
+        self.shown = self.shown.partition(text)[2]
+
+    def press(self, keys: bytes) -> None:
+        os.write(self.terminal, keys)
+
+    def is_raw(self) -> bool:
+        return not termios.tcgetattr(self.terminal)[3] & termios.ICANON
+
+    def until_raw(self, raw: bool) -> None:
+        deadline = time.monotonic() + _LIMIT
+        while self.is_raw() is not raw:
+            assert time.monotonic() < deadline, "the terminal has not changed"
+            time.sleep(0.01)
+
+    def wait(self, options: int = 0) -> int:
+        """Wait for a change of the process; what it shows is read meanwhile, for it would wait for that."""
+        deadline = time.monotonic() + _LIMIT
+        while time.monotonic() < deadline:
+            process, status = os.waitpid(self.process, options | os.WNOHANG)
+            if process:
+                return status
+            with suppress(OSError):
+                os.set_blocking(self.terminal, False)
+                os.read(self.terminal, 4_096)
+            os.set_blocking(self.terminal, True)
+            time.sleep(0.01)
+        raise AssertionError("it goes on")
+
+
+@contextmanager
+def session(path: Path, *options: str) -> Iterator[Session]:
+    process, terminal = pty.fork()
+    if process == 0:
+        with suppress(BaseException):
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            os.execve(TFBUS, [TFBUS, "play", str(path), *options], {**os.environ, "TERM": "xterm"})
+        os._exit(1)
+    try:
+        yield Session(process, terminal, termios.tcgetattr(terminal))
+    finally:
+        with suppress(OSError):
+            os.kill(process, signal.SIGKILL)
+            os.waitpid(process, 0)
+        os.close(terminal)
 
 
 @pytest.mark.thorough
-def test_a_bar_is_on_standard_error_if_that_is_a_terminal(tmp_path: Path, ten_seconds: Path) -> None:
-    command = ("play", str(ten_seconds), "--rate", "20", "--domain", new_domain())
-    status, shown = on_a_terminal(tmp_path / "output", *command)
-    assert status == 0
-    assert (tmp_path / "output").read_text() == ""
-    assert "playing \x1b" in shown
-    assert re.search(r"[1-9]\d?%", shown)
-    assert "102 samples in 102 messages played" in shown
+@pytest.mark.parametrize("options", [(), ("--clock",), ("--backend", "trio"), ("--clock", "--backend", "trio")])
+def test_keys_pause_step_and_change_the_rate_to_the_end(hour: Path, options: tuple[str, ...]) -> None:
+    with session(hour, "--domain", new_domain(), *options) as play:
+        play.expect("space pauses")
+        play.until_raw(True)
+        play.expect(" 0%")
+        play.press(b" ")
+        play.expect("paused")
+        # The next message, after an hour, and then the one after it.
+        play.press(b"s")
+        play.expect("50%")
+        play.press(b"\x1b[C")
+        play.press(b"-")
+        play.expect("0.5 x")
+        play.press(b"+++")
+        play.expect("5 x")
+        play.press(b" ")
+        play.expect("playing at 5 x")
+        play.press(b" s")
+        play.expect("4 samples in 4 messages played")
+        assert os.waitstatus_to_exitcode(play.wait()) == 0
+        assert termios.tcgetattr(play.terminal) == play.before
 
 
-class Recorded:
-    """A player that notes what is done with it."""
-
-    def __init__(self, paused: bool, rate: float) -> None:
-        self.paused = paused
-        self.rate = rate
-        self.done = ""
-
-    def pause(self) -> None:
-        self.done = "pause"
-
-    def resume(self) -> None:
-        self.done = "resume"
-
-    def step(self) -> None:
-        self.done = "step"
-
-
-@pytest.mark.parametrize(
-    ("key", "paused", "rate", "done", "after"),
-    [
-        (" ", False, 1.0, "pause", 1.0),
-        (" ", True, 1.0, "resume", 1.0),
-        ("s", False, 1.0, "step", 1.0),
-        ("right", True, 1.0, "step", 1.0),
-        ("x", False, 1.0, "", 1.0),
-        ("+", False, 1.0, "", 2.0),
-        ("=", False, 2.0, "", 5.0),
-        ("up", False, 3.0, "", 5.0),
-        ("-", False, 1.0, "", 0.5),
-        ("down", False, 3.0, "", 2.0),
-        # From a hundredth to five hundred times as fast.
-        ("-", False, 0.01, "", 0.01),
-        ("+", False, 500.0, "", 500.0),
-        ("+", False, 0.001, "", 0.01),
-        ("-", False, 1_000.0, "", 500.0),
-    ],
-)
-def test_each_key_does_one_thing(key: str, paused: bool, rate: float, done: str, after: float) -> None:
-    player = Recorded(paused, rate)
-    press(player, key)  # type: ignore[arg-type]
-    assert player.done == done
-    assert player.rate == pytest.approx(after)
+@pytest.mark.thorough
+@pytest.mark.parametrize("end", ["ctrl-c", "sigterm"])
+@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+def test_the_terminal_is_as_before_after_every_end(hour: Path, end: str, backend: str) -> None:
+    with session(hour, "--domain", new_domain(), "--backend", backend) as play:
+        play.expect("space pauses")
+        play.until_raw(True)
+        play.expect(" 0%")
+        if end == "ctrl-c":
+            play.press(b"\x03")
+        else:
+            os.kill(play.process, signal.SIGTERM)
+        play.expect("1 samples in 1 messages played")
+        assert os.waitstatus_to_exitcode(play.wait()) == (130 if end == "ctrl-c" else 143)
+        assert termios.tcgetattr(play.terminal) == play.before
 
 
-class Typed(Keyboard):
-    """Keys that are typed at once, on no terminal."""
-
-    def __init__(self, *typed: str) -> None:
-        super().__init__(-1)
-        self._typed = typed
-        self.read = anyio.Event()
-
-    async def keys(self) -> AsyncIterator[str]:
-        for key in self._typed:
-            yield key
-        self.read.set()
-        await anyio.sleep_forever()
-
-
-@pytest.mark.anyio
-async def test_keys_steer_the_player_and_a_stopped_program_plays_on_unless_it_was_paused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    keys, player = Typed(" ", " ", "+"), Player(Bus(), "run.mcap")
-    paused: list[bool] = []
-    ended_by: list[int] = []
-
-    async def signals() -> AsyncGenerator[signal.Signals, None]:
-        await keys.read.wait()
-        for before in (False, True):
-            if before:
-                player.pause()
-            yield signal.SIGTSTP
-            paused.append(player.paused)
-        yield signal.SIGTERM
-
-    monkeypatch.setattr(os, "kill", lambda *_: paused.append(player.paused))
-    async with aclosing(signals()) as received:
-        monkeypatch.setattr(play_module, "job_signals", partial(nullcontext, received))
-        with anyio.fail_after(10), anyio.CancelScope() as everything:
-            await _steer(keys, player, everything, ended_by)
-    assert capsys.readouterr().err.splitlines() == ["paused", "playing", "playing at 2 x"]
-    assert paused == [True, False, True, True]
-    assert everything.cancelled_caught
-    assert ended_by == [signal.SIGTERM]
-
-
-def test_with_a_keyboard_it_names_the_keys_and_sigterm_ends_it(
-    tfbus: Command, ten_seconds: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    @contextmanager
-    def job_signals() -> Iterator[AsyncIterator[signal.Signals]]:
-        async def signals() -> AsyncIterator[signal.Signals]:
-            yield signal.SIGTERM
-
-        yield signals()
-
-    monkeypatch.setattr(play_module, "keyboard", Typed)
-    monkeypatch.setattr(play_module, "job_signals", job_signals)
-    done, _ = play(tfbus, ten_seconds)
-    assert done.returncode == 128 + signal.SIGTERM
-    assert done.stderr.splitlines()[1].startswith("space pauses, s or the right arrow plays the next message")
-
-
-@pytest.mark.parametrize(
-    ("passes", "position", "told"),
-    [
-        (0, None, "7 samples in 5 messages played in 1.5 s"),
-        (1, 3 * SECOND, "7 samples in 5 messages played in 1.5 s, 2.0 s of the recording"),
-        (2, 3 * SECOND, "7 samples in 5 messages played in 1.5 s, 2 times to the end"),
-    ],
-)
-def test_the_last_line_counts_what_was_played(
-    capsys: pytest.CaptureFixture[str], passes: int, position: int | None, told: str
-) -> None:
-    with Bus() as bus:
-        player = Player(bus, "run.mcap")
-        player.played, player.messages, player.passes = 7, 5, passes
-        player.start, player.position = SECOND, position
-        _print_summary(player, bus, 1.5)
-        assert capsys.readouterr().err == f"{told}\n"
-        player.bad = Counter(nan=2)
-        _print_summary(player, bus, 1.5)
-        assert capsys.readouterr().err == f"{told}\ntfbus: left out: 2 x nan\n"
-
-
-@pytest.mark.anyio
-async def test_the_bar_shows_how_far_and_how_fast_it_plays(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setenv("TERM", "xterm")
-    player = Player(Bus(), "run.mcap", rate=2.0)
-    player.start, player.end, player.position = 10 * SECOND, 14 * SECOND, 11 * SECOND
-    player.pause()
-    with anyio.move_on_after(0.0):
-        await _show_progress(player)
-    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
-    assert "paused at 2 x" in shown
-    assert " 25%" in shown
+@pytest.mark.thorough
+def test_the_terminal_is_as_before_while_the_program_is_stopped(hour: Path) -> None:
+    with session(hour, "--domain", new_domain()) as play:
+        play.expect("space pauses")
+        play.until_raw(True)
+        play.expect(" 0%")
+        for _ in range(2):
+            play.press(b"\x1a")
+            assert os.WIFSTOPPED(play.wait(os.WUNTRACED))
+            assert termios.tcgetattr(play.terminal) == play.before
+            os.kill(play.process, signal.SIGCONT)
+            play.until_raw(True)
+        play.press(b" ")
+        play.expect("paused")
+        play.press(b"\x03")
+        assert os.waitstatus_to_exitcode(play.wait()) == 130
+        assert termios.tcgetattr(play.terminal) == play.before

@@ -1,3 +1,5 @@
+"""``tfbus query``."""
+
 import csv
 import json
 import re
@@ -11,6 +13,7 @@ from support.recorded import SMALL, Line, real, write_mcap
 from support.samples import moving, static
 
 from tfbus import TransformTree, from_seconds
+from tfbus.cli.commands.query import Row, print_rows
 from tfbus.recording import load
 
 SECOND = 1_000_000_000
@@ -73,18 +76,6 @@ def test_the_rows_are_those_of_single_lookups(tfbus: Command) -> None:
         assert [float(row[name]) for name in ("qx", "qy", "qz", "qw")] == pytest.approx(found.rotation, abs=1e-12)
 
 
-def test_json_and_csv_have_the_same_numbers(recording: Path, tfbus: Command) -> None:
-    table = list(csv.DictReader(StringIO(tfbus("query", recording, "map", "arm", "--every", "0.1", "--csv").stdout)))
-    lines = [
-        json.loads(line)
-        for line in tfbus("query", recording, "map", "arm", "--every", "0.1", "--json").stdout.splitlines()
-    ]
-    assert len(table) == len(lines) == 48
-    for row, line in zip(table, lines, strict=True):
-        assert row["stamp"] == line["stamp"]
-        assert [float(value) for value in row.values()][1:] == [*line["translation"], *line["rotation"]]
-
-
 def test_the_table_has_columns_with_units(recording: Path, tfbus: Command) -> None:
     done = tfbus("query", recording, "map", "base", "--every", "5")
     head, *lines = done.stdout.splitlines()
@@ -107,34 +98,24 @@ def test_a_static_transform_is_one_row(recording: Path, tfbus: Command) -> None:
     assert [line.split(",")[1] for line in done.stdout.splitlines()] == ["x", "100.0"]
 
 
+@pytest.mark.parametrize(
+    ("every", "rows", "left_out"),
+    # A chunk of instants covers two seconds of the second one.
+    [("1", 8, "3 of 11"), ("0.0005", 14_001, "6,000 of 20,001")],
+)
 def test_instants_at_which_the_frames_are_not_connected_are_left_out_and_counted(
-    tmp_path: Path, tfbus: Command
+    tmp_path: Path, tfbus: Command, every: str, rows: int, left_out: str
 ) -> None:
-    # From 4 s to 6 s the box is on an island.
-    lines = [
-        (
-            k,
-            "/tf",
-            [moving("map", "robot", k * SECOND), moving("map" if not 4 <= k < 7 else "island", "box", k * SECOND, k)],
-        )
-        for k in range(11)
-    ]
-    done = tfbus("query", write_mcap(tmp_path / "run.mcap", lines), "robot", "box", "--every", "1", "--csv")
-    stamps = [line.partition(".")[0] for line in done.stdout.splitlines()[1:]]
-    assert done.returncode == 0
-    assert stamps == ["0", "1", "2", "3", "7", "8", "9", "10"]
-    assert done.stderr == "tfbus: 3 of 11 instants are left out, the frames are not connected there\n"
-
-
-def test_a_whole_chunk_of_instants_without_a_transform_is_counted_too(tmp_path: Path, tfbus: Command) -> None:
-    # From 4 s to 7 s the box is on an island; a chunk of instants covers two seconds.
+    # From 4 s to 7 s the box is on an island.
     lines = [
         (k, "/tf", [moving("map", "robot", k * SECOND), moving("island" if 4 <= k < 7 else "map", "box", k * SECOND)])
         for k in range(11)
     ]
-    done = tfbus("query", write_mcap(tmp_path / "run.mcap", lines), "robot", "box", "--every", "0.0005", "--csv")
-    assert len(done.stdout.splitlines()) == 1 + 14_001
-    assert done.stderr == "tfbus: 6,000 of 20,001 instants are left out, the frames are not connected there\n"
+    done = tfbus("query", write_mcap(tmp_path / "run.mcap", lines), "robot", "box", "--every", every, "--csv")
+    stamps = [float(line.partition(",")[0]) for line in done.stdout.splitlines()[1:]]
+    assert (done.returncode, len(stamps)) == (0, rows)
+    assert not [stamp for stamp in stamps if 3.0 < stamp < 7.0 and every == "1"]
+    assert done.stderr == f"tfbus: {left_out} instants are left out, the frames are not connected there\n"
 
 
 @pytest.mark.parametrize(
@@ -190,17 +171,6 @@ def test_a_wrong_call_is_one_line_and_status_2(
 ) -> None:
     done = tfbus("query", recording, "map", "base", *options)
     check_wrong_call(done, why)
-
-
-@pytest.mark.parametrize("content", [None, b"", b"\x89MCAP0\r\n\x01", b"Dear diary,\n"])
-def test_a_file_that_is_no_recording_is_one_line_and_status_2(
-    tmp_path: Path, content: bytes | None, tfbus: Command
-) -> None:
-    path = tmp_path / "run.mcap"
-    if content is not None:
-        path.write_bytes(content)
-    done = tfbus("query", path, "a", "b")
-    check_wrong_call(done, f"recording '{path}': ")
 
 
 def test_invalid_transforms_of_the_recording_are_counted_on_standard_error(tfbus: Command) -> None:
@@ -310,3 +280,29 @@ def test_a_speed_limit_leaves_out_what_cannot_be(tmp_path: Path, tfbus: Command)
     )
     assert json.loads(done.stdout)["translation"] == [2.0, 0.0, 0.0]
     assert "1 x speed" in done.stderr
+
+
+def test_without_rows_nothing_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    for kind in ("table", "csv", "json", "tum"):
+        print_rows([], kind, several=False)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_where_a_line_does_not_fit_the_quaternion_is_on_a_second_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    row = Row("map", "base", 1_396_293_888_050_000_001, [1e12, -2.0, 0.5], [0.0, 0.0, 0.0, 1.0])
+    heights = {}
+    for width in (60, 103, 104):
+        monkeypatch.setenv("COLUMNS", str(width))
+        print_rows([row], "table", several=False)
+        lines = capsys.readouterr().out.splitlines()
+        assert max(map(len, lines)) <= width
+        heights[width] = len(lines)
+        numbers = (
+            "1396293888.050000001  1.0000e+12   -2.000000    0.500000    0.000000    0.000000    0.000000    1.000000"
+        )
+        assert " ".join(lines).split()[-8:] == numbers.split()
+        # All of one width, however large.
+        assert width < 104 or lines[-1].endswith(numbers)
+    assert heights == {60: 4, 103: 4, 104: 2}

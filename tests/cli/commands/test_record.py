@@ -84,25 +84,15 @@ def test_samples_that_ros_cannot_hold_are_counted(tmp_path: Path, tfbus: Command
     assert warning.startswith("tfbus: left out, as ROS cannot hold them: 1 x ")
 
 
-@pytest.mark.parametrize(
-    ("statistics", "lines"),
-    [
-        (counters(samples=1_234), ["1,234 samples in run.mcap"]),
-        (
-            counters(samples=5, dropped=1_000, conflated=2),
-            ["5 samples in run.mcap", "tfbus: 1,002 samples were lost, because the disk was too slow or failed"],
-        ),
-        (
-            counters(samples=5, unattributed=1),
-            ["5 samples in run.mcap", "tfbus: 1 samples are recorded without their authority: too many of them"],
-        ),
-    ],
-)
-def test_the_summary_warns_of_lost_samples_and_lost_authorities(
-    statistics: RecorderStatistics, lines: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    print_summary(Path("run.mcap"), statistics)
-    assert capsys.readouterr() == ("", "".join(f"{line}\n" for line in lines))
+def test_the_summary_warns_of_lost_samples_and_lost_authorities(capsys: pytest.CaptureFixture[str]) -> None:
+    print_summary(Path("run.mcap"), counters(samples=1_234))
+    assert capsys.readouterr() == ("", "1,234 samples in run.mcap\n")
+    print_summary(Path("run.mcap"), counters(samples=5, dropped=1_000, conflated=2, unattributed=1))
+    assert capsys.readouterr().err.splitlines() == [
+        "5 samples in run.mcap",
+        "tfbus: 1,002 samples were lost, because the disk was too slow or failed",
+        "tfbus: 1 samples are recorded without their authority: too many of them",
+    ]
 
 
 def test_lost_samples_are_warned_of_and_a_failure_ends_it(tmp_path: Path, tfbus: Command) -> None:

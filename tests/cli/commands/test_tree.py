@@ -1,55 +1,23 @@
+"""``tfbus tree``."""
+
 import errno
 import json
 import os
-import pty
 import re
 import shutil
-import signal
-import subprocess
-from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from support.commands import START, Command, check_wrong_call
-from support.processes import PATIENCE, TFBUS, free_address, new_domain, start_tfbus
+from support.processes import free_address, new_domain, start_tfbus
 from support.samples import moving, static
 
-from tfbus import SECOND, Bus, Edge
-from tfbus.cli.commands.tree import to_document
+from tfbus import SECOND, Bus
 
 TREE = r"""base_link
 ├── base_laser  \d+\.\d Hz  age .+  span .+  from 'robot_tf_publisher'
 └── camera      static  from 'tfbus static'
 """
-
-
-def test_the_document_has_each_frame_with_its_edge_and_null_for_missing_values() -> None:
-    odometry = Edge("map", "base_link", False, 101, 2 * SECOND, 4 * SECOND, "odometry")
-    mount = Edge("base_link", "lidar", True, 1, None, None, "")
-    assert to_document("tf", ["base_link", "lidar", "map"], [odometry, mount], 5 * SECOND) == {
-        "domain": "tf",
-        "stamp": 5 * SECOND,
-        "frames": {
-            "base_link": {
-                "parent": "map",
-                "kind": "moving",
-                "rate": 50.0,
-                "age": 1.0,
-                "span": 2.0,
-                "authority": "odometry",
-            },
-            "lidar": {
-                "parent": "base_link",
-                "kind": "static",
-                "rate": None,
-                "age": None,
-                "span": None,
-                "authority": "",
-            },
-            "map": {"parent": None, "kind": "root", "rate": None, "age": None, "span": None, "authority": None},
-        },
-    }
 
 
 async def publish(bus: Bus) -> None:
@@ -81,31 +49,39 @@ def test_the_tree_is_shown_after_the_duration_and_written_for_graphviz(
 @pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
 def test_the_picture_has_every_fact_of_each_edge(tfbus: Command, tmp_path: Path) -> None:
     async def publish_late(bus: Bus) -> None:
-        bus.publish(static("base", "camera", authority="me"))
+        bus.publish(static("base", "bäse", authority="me"))
         async for _ in bus.clock.ticks(10.0):
             bus.publish(moving("base", "laser", bus.clock.now() - SECOND // 50, authority="driver"))
 
-    svg, pdf = tmp_path / "frames.svg", tmp_path / "frames.pdf"
-    done = tfbus.on_domain(publish_late, "tree", "--duration", "1.05", "--svg", svg, "--pdf", pdf)
+    svg, pdf, png = (tmp_path / f"frames.{kind}" for kind in ("svg", "pdf", "png"))
+    done = tfbus.on_domain(publish_late, "tree", "--duration", "1.05", "--svg", svg, "--pdf", pdf, "--png", png)
     assert (done.returncode, done.stderr) == (0, "")
     drawn = svg.read_text(encoding="utf-8")
-    texts = ["base", "camera", "static", "me", "laser", "10.0 Hz", "driver", "delay 20 ms"]
+    texts = ["base", "bäse", "static", "me", "laser", "10.0 Hz", "driver", "delay 20 ms"]
     assert [text for text in texts if f">{text}<" not in drawn] == []
     assert "#009e73" in drawn
-    assert pdf.read_bytes().startswith(b"%PDF")
+    assert (pdf.read_bytes()[:4], png.read_bytes()[:4]) == (b"%PDF", b"\x89PNG")
 
 
-def test_by_default_it_listens_for_a_second(tfbus: Command) -> None:
+def test_by_default_it_listens_for_a_second_and_json_has_each_frame_with_null_for_missing_values(
+    tfbus: Command,
+) -> None:
     done = tfbus.on_domain(publish, "tree", "--json", "--domain", "yard")
     assert done.returncode == 0
-    document = json.loads(done.stdout)
-    assert (document["domain"], document["stamp"], set(document["frames"])) == (
-        "yard",
-        101 * SECOND,
-        {"base", "camera"},
-    )
+    nothing = {"rate": None, "age": None, "span": None}
+    assert json.loads(done.stdout) == {
+        "domain": "yard",
+        "stamp": 101 * SECOND,
+        "frames": {
+            "base": {"parent": None, "kind": "root", **nothing, "authority": None},
+            "camera": {"parent": "base", "kind": "static", **nothing, "authority": "me"},
+        },
+    }
     # For people: an indented document.
     assert len(done.stdout.splitlines()) > 10
+    done = tfbus.on_domain(publish, "tree", "--json", "--duration", "2.45")
+    laser = {"parent": "base", "kind": "moving", "rate": 10.0, "age": 0.05, "span": 0.4, "authority": "driver"}
+    assert json.loads(done.stdout)["frames"]["laser"] == laser
 
 
 def test_it_waits_for_the_first_transform_and_ends_at_ctrl_c(tfbus: Command) -> None:
@@ -159,42 +135,6 @@ def test_it_shows_what_programs_on_the_domain_send(backend: str) -> None:
     assert re.fullmatch(TREE, tree.output.text)
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize(("environment", "coloured"), [({}, True), ({"NO_COLOR": "1"}, False)])
-def test_on_a_terminal_it_is_redrawn_in_place_and_in_colour_unless_forbidden(
-    environment: Mapping[str, str], coloured: bool
-) -> None:
-    options = ("--domain", new_domain())
-    screen, terminal = pty.openpty()
-    plain = {name: value for name, value in os.environ.items() if name not in {"NO_COLOR", "FORCE_COLOR"}}
-    with start_tfbus("static", "map", "odom", *options):
-        watch = subprocess.Popen(
-            [TFBUS, "tree", "--watch", "--rate", "20", *options],
-            stdin=terminal,
-            stdout=terminal,
-            stderr=terminal,
-            env={**plain, "TERM": "xterm-256color", **environment},
-            start_new_session=True,
-        )
-        os.close(terminal)
-        with watch:
-            seen = b""
-            # One line up, to the first of the two lines.
-            while seen.count(b"\x1b[1A") < 2:
-                seen += os.read(screen, 4096)
-            watch.send_signal(signal.SIGINT)
-            # At the end of the program, Linux raises an error.
-            with suppress(OSError):
-                while more := os.read(screen, 4096):
-                    seen += more
-            assert watch.wait(PATIENCE) == 130
-        os.close(screen)
-    assert (b"\x1b[36m" in seen) is coloured
-    # The cursor is shown at the end.
-    assert seen.rindex(b"\x1b[?25h") > seen.rindex(b"\x1b[?25l")
-    assert b"Traceback" not in seen
-
-
 def test_it_listens_until_each_frame_was_heard_twice_and_all_are_connected(tfbus: Command) -> None:
     async def publish_slowly(bus: Bus) -> None:
         bus.publish([static("base", "camera"), static("odom_combined", "anchor")])
@@ -228,3 +168,23 @@ def test_it_says_what_it_could_not_see_within_five_seconds(tfbus: Command) -> No
     assert json.loads(tfbus.on_domain(publish_once, "tree", "--json", "--duration", "2").stdout)["stamp"] == (
         START + 2 * SECOND
     )
+
+
+def test_without_graphviz_the_error_says_what_to_install(
+    tfbus: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    done = tfbus.on_domain(publish, "tree", "--pdf", tmp_path / "frames.pdf")
+    check_wrong_call(done, "--pdf needs Graphviz: install it (apt install graphviz")
+
+
+def test_a_complaint_of_graphviz_is_a_usage_error(
+    tfbus: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "dot"
+    program.write_text("#!/bin/sh\necho 'syntax error\nnear line 1' >&2; exit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    done = tfbus.on_domain(publish, "tree", "--svg", tmp_path / "frames.svg")
+    check_wrong_call(done, "Graphviz could not draw the tree: syntax error near line 1")
+    assert list(tmp_path.iterdir()) == [program]

@@ -66,18 +66,9 @@ def test_a_recording_is_no_live_page_and_has_the_options_of_the_command(
     )
     check_wrong_call(tfbus("view", recording, *options), "cannot use port 8081: in use")
     (given,) = asked
-    assert given == {
-        "port": 8081,
-        "edges": 1,
-        "host": "127.0.0.1",
-        "origins": ("https://robot.example",),
-        "fixed": "map",
-        "trails": ("base",),
-        "urdf": None,
-        "package_paths": (),
-        "rate": 5.0,
-        "live": False,
-    }
+    named = {"origins": ("https://robot.example",), "fixed": "map", "trails": ("base",), "rate": 5.0, "live": False}
+    by_default = {"host": "127.0.0.1", "urdf": None, "package_paths": ()}
+    assert given == {"port": 8081, "edges": 1, **named, **by_default}
 
 
 @pytest.mark.parametrize(

@@ -1,1 +1,1 @@
-"""The subcommands of ``tfbus``, one module each."""
+"""The subcommands of ``tfbus``, one module each; those of the tutorial share one."""

@@ -6,9 +6,8 @@ import anyio
 from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
-from tfbus.cli._ros import is_ros
 from tfbus.cli.arguments import Backend, UsageError
-from tfbus.cli.domain import LinkOptions
+from tfbus.cli.domain import LinkOptions, is_ros
 from tfbus.cli.output import say
 
 

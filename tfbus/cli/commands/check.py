@@ -1,7 +1,6 @@
 """``tfbus check``."""
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -11,22 +10,20 @@ from cyclopts import Parameter
 
 from tfbus.analysis.examiner import Examiner, Finding, Limits
 from tfbus.bus.bus import Bus
-from tfbus.cli._width import terminal_width, wrapped
+from tfbus.cli.application import FAILED
 from tfbus.cli.arguments import (
-    DEFAULT_TOPICS,
     Duration,
     Instant,
     JsonFlag,
     Positive,
-    TopicOptions,
     UsageError,
 )
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import progress, say, warn
+from tfbus.cli.output import fitted, progress, say, warn
+from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions
 from tfbus.geometry.stamped import Batch
 from tfbus.recording.examine import examine
 
-_WRONG = 1
 _DEFAULT = Limits()
 _SUFFIXES = (".mcap", ".bag", ".db3", ".active")
 
@@ -44,7 +41,7 @@ def check(
     as_json: JsonFlag = False,
     topics: TopicOptions = DEFAULT_TOPICS,
     link: LinkOptions = DEFAULT_LINK,
-) -> None:
+) -> int:
     """Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.
 
     The exit status is 0 if nothing is wrong and 1 if something is; a recording that is cut, or that its writer did not
@@ -83,7 +80,7 @@ def check(
         print(json.dumps([{**asdict(finding), "advice": finding.advice} for finding in findings], indent=2))
     else:
         _print(findings)
-    sys.exit(0 if all(finding.is_hint for finding in findings) else _WRONG)
+    return 0 if all(finding.is_hint for finding in findings) else FAILED
 
 
 def _check_file(
@@ -120,4 +117,4 @@ def _print(findings: Sequence[Finding]) -> None:
         print("nothing is wrong")
     for finding in findings:
         for line in (f"{finding.kind:<16}  {finding}", f"{'':16}  -> {finding.advice}"):
-            print("\n".join(wrapped(line, terminal_width(), 18)))
+            print(fitted(line, 18))

@@ -8,11 +8,18 @@ from typing import Any
 
 from tfbus.analysis import Comparison
 from tfbus.analysis.compare import compare as compare_trees
-from tfbus.cli._table import Column, table_lines
-from tfbus.cli._width import terminal_width, wrapped
-from tfbus.cli.arguments import DEFAULT_TOPICS, CsvFlag, Duration, Flag, JsonFlag, TopicOptions, UsageError
-from tfbus.cli.output import csv_name, csv_writer, format_counts, format_seconds, progress, warn
-from tfbus.recording.recording import Problems, fill
+from tfbus.cli.arguments import CsvFlag, Duration, Flag, JsonFlag, UsageError
+from tfbus.cli.output import (
+    Column,
+    csv_name,
+    csv_writer,
+    fitted,
+    format_seconds,
+    table_lines,
+    terminal_width,
+    warn,
+)
+from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions, load_tree
 from tfbus.tree.tree import TransformTree
 
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
@@ -63,7 +70,7 @@ def compare(
     """
     if as_csv and as_json:
         raise UsageError("--csv and --json are two ways to print the same: give one of them")
-    wanted, judged = (_load(file, topics) for file in (reference, estimate))
+    wanted, judged = (load_tree(file, topics, named=True)[0] for file in (reference, estimate))
     found = {}
     for text, (target, source) in (_pairs(pair) if pair else _moving_pairs(wanted, judged)).items():
         for aligned in (False,) if as_csv else (False, True):
@@ -114,19 +121,6 @@ def _moving_pairs(wanted: TransformTree, judged: TransformTree) -> dict[str, tup
     return pairs
 
 
-def _load(file: Path, topics: TopicOptions) -> TransformTree:
-    tree = TransformTree(keep=None)
-    problems = Problems()
-    with topics.open(file) as recording, progress(recording.count, "reading") as advance:
-        fill(tree, recording, problems, progress=advance)
-        remarks = recording.remarks
-    if problems:
-        warn(f"left out of {file}: {format_counts(problems)}")
-    for line in (*problems.details, *remarks):
-        warn(f"{file}: {line}")
-    return tree
-
-
 def _rows(found: Comparison) -> Iterator[tuple[str, str, Any]]:
     """Name, unit and statistics of each kind of error."""
     for kind, errors in (("absolute", found.absolute), ("relative", found.relative)):
@@ -158,9 +152,10 @@ def _print_tables(found: dict[tuple[str, bool], Comparison]) -> None:
         how = "aligned" if aligned else "not aligned"
         if each.alignment is not None and each.alignment.scale != 1.0:
             how += f" and scaled by {each.alignment.scale:.6g}"
-        before = "\n" if number else ""
+        if number:
+            print()
         heading = f"{text}, {how}: {each.poses:,} poses of {each.of[0]:,} and {each.of[1]:,}"
-        print(before + "\n".join(wrapped(heading, terminal_width(), 2)))
+        print(fitted(heading))
         rows = [
             (name, unit, *(f"{getattr(statistics, key):.6g}" for key in _STATISTICS))
             for name, unit, statistics in _rows(each)

@@ -6,11 +6,9 @@ from collections.abc import Callable, Iterable
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
-from tfbus.cli._replay_clock import ReplayClock
-from tfbus.cli._width import cells, terminal_width, wrapped
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups
-from tfbus.cli.output import format_seconds, print_now, say
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups, ReplayClock
+from tfbus.cli.output import cells, format_seconds, print_now, say, terminal_width, wrapped
 from tfbus.clock import Clock, SystemClock
 from tfbus.errors import MAY_COME, ClockResetError, InvalidTransformError, TransformLookupError
 from tfbus.frames import check_frame

@@ -7,13 +7,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from tfbus.cli._table import Column, table_lines
-from tfbus.cli._width import terminal_width, wrapped
-from tfbus.cli.arguments import DEFAULT_TOPICS, Flag, JsonFlag, TopicOptions
-from tfbus.cli.output import format_counts, format_seconds, progress
+from tfbus.cli.arguments import Flag, JsonFlag
+from tfbus.cli.output import (
+    Column,
+    format_counts,
+    format_seconds,
+    format_span,
+    progress,
+    table_lines,
+    terminal_width,
+    wrapped,
+)
+from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions
 from tfbus.recording.recording import RecordedTopic
 from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, Spread, summarise
-from tfbus.stamps import SECOND, format_duration, from_seconds
+from tfbus.stamps import SECOND
 
 _SPREADS = tuple(
     Column(f"{what} {value}", right=True) for what in ("period", "delay") for value in ("mean", "p99", "max")
@@ -135,8 +143,8 @@ def _frame_row(frame: FrameSummary) -> tuple[str, ...]:
         "static, moving" if frame.kind == "both" else frame.kind,
         f"{frame.static + frame.moving:,}",
         "" if frame.rate is None else f"{frame.rate:.1f} Hz",
-        _duration(frame.span),
-        _duration(frame.longest_gap),
+        format_span(frame.span),
+        format_span(frame.longest_gap),
         _join_names(frame.authorities),
     )
 
@@ -155,14 +163,10 @@ def _topic_row(topic: RecordedTopic) -> tuple[str, ...]:
 
 def _times(*spreads: Spread | None) -> list[str]:
     return [
-        _duration(value)
+        format_span(value)
         for spread in spreads
         for value in ((None, None, None) if spread is None else (spread.mean, spread.p99, spread.max))
     ]
-
-
-def _duration(seconds: float | None) -> str:
-    return "" if seconds is None else format_duration(from_seconds(seconds))
 
 
 def _join_names(names: Iterable[str]) -> str:

@@ -6,16 +6,17 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
+from rich.text import Text
+
 from tfbus.analysis.arrivals import Arrival, Arrivals
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
-from tfbus.cli._table import Column, table_lines
-from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Positive, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import print_now
+from tfbus.cli.output import Column, format_span, print_now, table_lines, terminal_width, wrapped
+from tfbus.cli.tree_display import TreeDisplay
 from tfbus.errors import TransformLookupError
-from tfbus.stamps import format_duration, from_seconds
+from tfbus.stamps import from_seconds
 from tfbus.tree.tree import TransformTree
 
 # The least important column has the lowest number.
@@ -93,10 +94,6 @@ def monitor(
     as_json
         Print a JSON object instead, one a line unless --once is given; durations in s.
     """
-    from rich.text import Text
-
-    from tfbus.cli._tree_display import TreeDisplay
-
     pair = None
     if target is not None:
         if source is None:
@@ -169,7 +166,7 @@ def _describe(chain: Chain) -> str:
     if not chain.frames:
         return f"no transform: {chain.problem}"
     way = " <- ".join(chain.frames)
-    age = "static" if chain.age is None else f"age {_duration(chain.age)}"
+    age = "static" if chain.age is None else f"age {format_span(chain.age)}"
     slowest = f", the slowest is {chain.slowest}" if chain.slowest else ""
     return f"{way}: {age}{slowest}"
 
@@ -182,15 +179,11 @@ def _row(arrival: Arrival) -> tuple[str, ...]:
         arrival.frame,
         arrival.authority,
         state,
-        _duration(arrival.delay_mean),
-        _duration(arrival.delay_p99),
-        _duration(arrival.delay_max),
-        _duration(arrival.jitter),
-        _duration(arrival.longest_gap),
+        format_span(arrival.delay_mean),
+        format_span(arrival.delay_p99),
+        format_span(arrival.delay_max),
+        format_span(arrival.jitter),
+        format_span(arrival.longest_gap),
         f"{arrival.late:,}" if counted else "",
         f"{arrival.lost:,}" if counted else "",
     )
-
-
-def _duration(seconds: float | None) -> str:
-    return "" if seconds is None else format_duration(from_seconds(seconds))

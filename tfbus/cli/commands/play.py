@@ -1,31 +1,42 @@
 """``tfbus play``."""
 
+import os
 import signal
 import sys
 import time
 from collections import Counter
+from collections.abc import AsyncIterator, Iterator
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import anyio
 from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
-from tfbus.cli._keyboard import Keyboard, follow_job, job_signals, keyboard
-from tfbus.cli.arguments import DEFAULT_TOPICS, Flag, Instant, Speed, Time, TopicOptions, UsageError
+from tfbus.cli.application import ENDED_BY_SIGNAL
+from tfbus.cli.arguments import Flag, Instant, Speed, Time, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import format_counts, say, warn
+from tfbus.cli.output import format_counts, progress_bar, say, warn
+from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions
 from tfbus.clock import SimulatedClock
 from tfbus.events import PeerJoined
 from tfbus.recording.player import Player
 from tfbus.stamps import to_seconds
 
+try:
+    import termios
+except ImportError:
+    # On Windows.
+    termios = None  # type: ignore[assignment]
+
 _DISCOVERY = 1.0
 """s; other programs are found within, or are not there."""
 _REDRAW_PERIOD = 0.1
 _RATES: Final = tuple(factor * 10.0**power for power in range(-2, 3) for factor in (1, 2, 5))
-_ENDED_BY_SIGNAL = 128
 _KEYS = "space pauses, s or the right arrow plays the next message, + and - change the rate"
+_ESCAPED: Final = {b"\x1b[A": "up", b"\x1b[B": "down", b"\x1b[C": "right", b"\x1b[D": "left"}
+_LONGEST: Final = 64
 
 
 def play(
@@ -39,7 +50,7 @@ def play(
     clock: Flag = False,
     topics: TopicOptions = DEFAULT_TOPICS,
     link: LinkOptions = DEFAULT_LINK,
-) -> None:
+) -> int:
     """Publish a recording on a domain with its original stamps and timing, static transforms first.
 
     On a terminal, the space bar pauses and goes on, s or the right arrow plays the next message, and + and -, or the
@@ -63,9 +74,10 @@ def play(
         Tell the time of the recording as well: echo, tree and listen follow it, so their ages are ages of then.
     """
     start, end = _log_times(file, topics, since, until)
-    ended_by: list[int] = []
 
-    async def play_to_domain(bus: Bus) -> None:
+    async def play_to_domain(bus: Bus) -> int:
+        # The status of a termination, which cancels the tasks before the player has ended.
+        status = ENDED_BY_SIGNAL + signal.SIGTERM
         player = Player(bus, file, rate=rate, loop=loop, since=start, until=end, **topics.arguments())
         await _wait_for_peer(bus)
         say(f"playing {file} on {link.place}")
@@ -76,15 +88,15 @@ def play(
                 keys = keyboard()
                 if keys is not None:
                     say(_KEYS)
-                    tasks.start_soon(_steer, keys, player, tasks.cancel_scope, ended_by)
+                    tasks.start_soon(_steer, keys, player, tasks.cancel_scope)
                 await player.play()
+                status = 0
                 tasks.cancel_scope.cancel()
         finally:
             _print_summary(player, bus, time.monotonic() - began)
+        return status
 
-    link.run(play_to_domain, clock=SimulatedClock() if clock else None)
-    if ended_by:
-        sys.exit(_ENDED_BY_SIGNAL + ended_by[0])
+    return link.run(play_to_domain, clock=SimulatedClock() if clock else None)
 
 
 def _print_summary(player: Player, bus: Bus, seconds: float) -> None:
@@ -99,18 +111,90 @@ def _print_summary(player: Player, bus: Bus, seconds: float) -> None:
         warn(f"left out: {format_counts(rejected)}")
 
 
-async def _steer(keys: Keyboard, player: Player, everything: anyio.CancelScope, ended_by: list[int]) -> None:
-    """Pause, step and change the rate by the keys; end everything at SIGTERM."""
-    was_paused = False
+class Keyboard:
+    """The keys that are pressed, for the body of a ``with``: ``async for key in keyboard.keys()``.
 
-    def stopped() -> None:
-        nonlocal was_paused
-        was_paused = player.paused
-        player.pause()
+    A key is its letter, or ``"up"``, ``"down"``, ``"left"``, ``"right"``. Ctrl-C and Ctrl-Z do what they always do.
 
-    def continued() -> None:
-        if not was_paused:
-            player.resume()
+    Parameters
+    ----------
+    terminal : int
+        A file descriptor.
+    """
+
+    def __init__(self, terminal: int) -> None:
+        self._terminal = terminal
+        self._before: list[Any] | None = None
+
+    def __enter__(self) -> "Keyboard":
+        self.take()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.give_back()
+
+    def take(self) -> None:
+        """Have the terminal pass each key on at once, and show none; does nothing in the background."""
+        with suppress(OSError, termios.error):
+            # To change the terminal from the background would stop the program.
+            if os.tcgetpgrp(self._terminal) != os.getpgrp():
+                return
+            found = termios.tcgetattr(self._terminal)
+            if self._before is None:
+                self._before = found
+            flags = [*found]
+            flags[3] &= ~(termios.ICANON | termios.ECHO)
+            termios.tcsetattr(self._terminal, termios.TCSADRAIN, flags)
+
+    def give_back(self) -> None:
+        """Set the terminal as it was before."""
+        before, self._before = self._before, None
+        if before is not None:
+            with suppress(OSError, termios.error):
+                termios.tcsetattr(self._terminal, termios.TCSADRAIN, before)
+
+    async def keys(self) -> AsyncIterator[str]:
+        """The keys, until the terminal is closed."""
+        while True:
+            await anyio.wait_readable(self._terminal)
+            try:
+                typed = os.read(self._terminal, _LONGEST)
+            except OSError:
+                return
+            if not typed:
+                return
+            for key in _split(typed):
+                yield key
+
+
+def _split(typed: bytes) -> Iterator[str]:
+    while typed:
+        if typed[:3] in _ESCAPED:
+            yield _ESCAPED[typed[:3]]
+            typed = typed[3:]
+        else:
+            yield typed[:1].decode("latin-1")
+            typed = typed[1:]
+
+
+def keyboard() -> Keyboard | None:
+    """The keyboard, if standard input is a terminal in whose foreground this program runs."""
+    if termios is None or not sys.stdin or not sys.stdin.isatty():
+        return None
+    terminal = sys.stdin.fileno()
+    with suppress(OSError):
+        if os.tcgetpgrp(terminal) == os.getpgrp():
+            return Keyboard(terminal)
+    return None
+
+
+def job_signals() -> AbstractContextManager[AsyncIterator[signal.Signals]]:
+    """The signals that stop, continue and end a program."""
+    return anyio.open_signal_receiver(signal.SIGTSTP, signal.SIGCONT, signal.SIGTERM)
+
+
+async def _steer(keys: Keyboard, player: Player, everything: anyio.CancelScope) -> None:
+    """Pause, step and change the rate by the keys; give the terminal back while stopped; end everything at SIGTERM."""
 
     async def read() -> None:
         async for key in keys.keys():
@@ -122,8 +206,18 @@ async def _steer(keys: Keyboard, player: Player, everything: anyio.CancelScope, 
     with job_signals() as signals, keys:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(read)
-            await follow_job(keys, signals, stopped, continued)
-            ended_by.append(signal.SIGTERM)
+            async for number in signals:
+                if number == signal.SIGTERM:
+                    break
+                if number == signal.SIGTSTP:
+                    was_paused = player.paused
+                    player.pause()
+                    keys.give_back()
+                    os.kill(os.getpid(), signal.SIGSTOP)
+                    if not was_paused:
+                        player.resume()
+                # The shell may have changed the terminal meanwhile.
+                keys.take()
             everything.cancel()
 
 
@@ -181,8 +275,6 @@ async def _show_progress(player: Player) -> None:
     """Show a progress bar until cancelled, if standard error is a terminal."""
     if not sys.stderr.isatty():
         return
-    from tfbus.cli._progress_bar import progress_bar
-
     with progress_bar() as bar:
         task = bar.add_task("playing", total=None)
         while True:

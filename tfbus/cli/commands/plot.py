@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from tfbus.cli.arguments import Flag, UsageError
 from tfbus.cli.output import track, write_file
-from tfbus.cli.recorded_tree import load_tree, warn_of_losses
+from tfbus.cli.recordings import load_tree, warn_of_losses
 from tfbus.errors import UnknownFrameError
 from tfbus.plain import printable
 from tfbus.recording.recording import Problems, open_recording

@@ -12,15 +12,13 @@ import anyio
 
 from tfbus.bus.bus import Bus
 from tfbus.bus.event_stream import EventStream
+from tfbus.cli.application import ENDED_BY_SIGNAL, FAILED
 from tfbus.cli.arguments import Duration, Flag, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_counts, say, warn
 from tfbus.events import RecordingDropped, RecordingFailed
 from tfbus.recording.recorder import Recorder
 from tfbus.statistics import RecorderStatistics
-
-_RECORDING_FAILED = 1
-_ENDED_BY_SIGNAL = 128
 
 
 def record(
@@ -30,7 +28,7 @@ def record(
     duration: Duration = math.inf,
     overwrite: Flag = False,
     link: LinkOptions = DEFAULT_LINK,
-) -> None:
+) -> int:
     """Record all transforms of a domain to FILE, in MCAP as ROS 2 and Foxglove read it, until Ctrl-C.
 
     Example: tfbus record run.mcap --duration 60
@@ -66,18 +64,15 @@ def record(
         if recorder.error is None:
             return status
         warn(f"the recording has ended early: {recorder.error}")
-        return _RECORDING_FAILED
+        return FAILED
 
     recorder_log = logging.getLogger("tfbus.recording")
     # The lines of this command say the same.
     recorder_log.propagate = False
     try:
-        status = link.run(record_domain)
+        return link.run(record_domain)
     finally:
         recorder_log.propagate = True
-    if status == _ENDED_BY_SIGNAL + signal.SIGINT:
-        raise KeyboardInterrupt
-    sys.exit(status)
 
 
 def _open_signals() -> AbstractContextManager[AsyncIterator[signal.Signals]]:
@@ -97,7 +92,7 @@ async def _wait_for_end(
         tasks.start_soon(link.first_transform, bus)
         tasks.start_soon(_watch_recorder, events, tasks.cancel_scope)
         with bus.clock.move_on_after(duration):
-            status = _ENDED_BY_SIGNAL + await _wait_for_signal(signals)
+            status = ENDED_BY_SIGNAL + await _wait_for_signal(signals)
         tasks.cancel_scope.cancel()
     return status
 

@@ -10,13 +10,20 @@ from pathlib import Path
 import anyio
 
 from tfbus.bus.bus import Bus
-from tfbus.cli._ros import ros_link
-from tfbus.cli._static_frames import publish_static
-from tfbus.cli._table import Column, table_lines
-from tfbus.cli._width import cells, narrow_guides, shorten, terminal_width
 from tfbus.cli.arguments import Flag, Rate, UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import format_numbers, format_transform, say, warn
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, publish_static, ros_link
+from tfbus.cli.output import (
+    Column,
+    cells,
+    format_numbers,
+    format_transform,
+    narrow_guides,
+    say,
+    shorten,
+    table_lines,
+    terminal_width,
+    warn,
+)
 from tfbus.errors import InvalidRobotError, InvalidTransformError
 from tfbus.geometry.stamped import MAX_TRANSLATION, check_translations
 from tfbus.geometry.transform import Transform
@@ -47,8 +54,8 @@ def robot(
     """Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at zero.
 
     Fixed joints are published once, the others again and again. A frame that is refused, because an edge of another
-    program is in its way, is tried again. A position beyond the limits of its joint is reported
-    and published all the same.
+    program is in its way, is tried again. A position beyond the limits of its joint is reported and
+    published all the same.
 
     Example: tfbus robot arm.urdf shoulder=0.5 elbow=-1.2 --tree
 

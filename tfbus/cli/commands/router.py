@@ -4,8 +4,8 @@ import os
 
 import anyio
 
-from tfbus.cli._event_loop import run
 from tfbus.cli.arguments import Backend, UsageError
+from tfbus.cli.domain import run
 from tfbus.cli.output import say
 from tfbus.errors import pip_install
 

@@ -9,9 +9,8 @@ import anyio
 from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
-from tfbus.cli._static_frames import publish_static
 from tfbus.cli.arguments import UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, publish_static
 from tfbus.cli.output import format_numbers, format_transform, say, warn
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import MAX_TRANSLATION, TransformStamped, check_translations
@@ -38,8 +37,7 @@ def static(
     """Publish the static transform of CHILD in PARENT, or all that a file holds, until Ctrl-C.
 
     Programs that join later receive it too. If an edge of another program is in its way, it is tried again once a
-    second. After the end, programs that have it keep it; those that join do not get
-    it.
+    second. After the end, programs that have it keep it; those that join do not get it.
 
     Example: tfbus static base_link base_laser --xyz 0.1 0 0.2 --rpy 0 0 1.5708
 

@@ -1,6 +1,7 @@
 """``tfbus tree``."""
 
 import json
+import subprocess
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,10 @@ import anyio.to_thread
 from tfbus.analysis.arrivals import Delays
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
-from tfbus.cli._graphviz import draw
-from tfbus.cli._replay_clock import ReplayClock
-from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, ReplayClock
 from tfbus.cli.output import print_now, say, write_file
+from tfbus.cli.tree_display import TreeDisplay
 from tfbus.stamps import to_seconds
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import to_dot
@@ -65,8 +65,6 @@ def tree(
         Print a JSON document instead, with --watch one a line: for each frame its parent, kind, rate (Hz), age (s),
         span (s) and authority; null for a value that the frame does not have.
     """
-    from tfbus.cli._tree_display import TreeDisplay
-
     pictures = {kind: path for kind, path in (("svg", svg), ("pdf", pdf), ("png", png)) if path is not None}
 
     async def show_tree(bus: Bus) -> None:
@@ -156,3 +154,29 @@ def _describe(edge: Edge | None, now: int) -> dict[str, Any]:
         "span": span,
         "authority": edge.authority,
     }
+
+
+def draw(dot: str, kind: str, path: Path) -> None:
+    """Draw a graph into a file, all of it or nothing; a pipe or a device is written to directly.
+
+    Parameters
+    ----------
+    dot : str
+        The graph in Graphviz's language.
+    kind : {"svg", "pdf", "png"}
+    path : Path
+
+    Raises
+    ------
+    UsageError
+        If Graphviz is not installed or fails, or the file cannot be written.
+    """
+    try:
+        drawn = subprocess.run(["dot", f"-T{kind}"], input=dot.encode(), capture_output=True, check=False)
+    except FileNotFoundError:
+        raise UsageError(
+            f"--{kind} needs Graphviz: install it (apt install graphviz, brew install graphviz), or write --dot"
+        ) from None
+    if drawn.returncode != 0:
+        raise UsageError(f"Graphviz could not draw the tree: {' '.join(drawn.stderr.decode(errors='replace').split())}")
+    write_file(path, drawn.stdout)

@@ -8,11 +8,10 @@ import anyio
 from tfbus._aio.web_door import WebDoor
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
-from tfbus.cli._event_loop import run
 from tfbus.cli.arguments import Port, Rate, UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, run
 from tfbus.cli.output import print_now, say
-from tfbus.cli.recorded_tree import load_tree
+from tfbus.cli.recordings import load_tree
 from tfbus.errors import InvalidRobotError, InvalidTransformError
 from tfbus.frames import check_frame
 

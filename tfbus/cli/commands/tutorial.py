@@ -1,19 +1,23 @@
-"""The robot of the classic tf tutorial, as two timed tasks.
+"""``tfbus broadcast``, ``tfbus listen`` and ``tfbus demo``: the robot of the classic tf tutorial.
 
 A laser is mounted 0.1 m forward of the centre of the base and 0.2 m above it. A broadcaster sends that transform at
-100 Hz; once a second, a listener transforms a point from the frame of the laser to that of the base and prints it.
+100 Hz; once a second, a listener transforms a point from the frame of the laser to that of the base and prints it. They
+are two programs of a domain, or for ``demo`` two tasks of one process.
 """
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import anyio
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.broadcaster import TransformBroadcaster
 from tfbus.bus.bus import Bus
-from tfbus.cli.output import format_seconds
-from tfbus.clock import Clock, SimulatedClock
+from tfbus.cli.arguments import Backend, Duration, Flag, Rate
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, ReplayClock, run
+from tfbus.cli.output import fitted, format_seconds, print_now, say
+from tfbus.clock import Clock, SimulatedClock, SystemClock
 from tfbus.data import PointStamped
 from tfbus.errors import TransformError
 from tfbus.geometry.transform import Transform
@@ -27,7 +31,88 @@ POINT: Vector = (1.0, 0.2, 0.0)
 Print = Callable[[str], object]
 
 
-async def broadcast(bus: Bus, rate: float = 100.0) -> None:
+def broadcast(*, rate: Rate = 100.0, link: LinkOptions = DEFAULT_LINK) -> None:
+    """Broadcast the transform of the tutorial's laser, until Ctrl-C; `tfbus listen` in another terminal receives it.
+
+    Example: tfbus broadcast --rate 50
+
+    Parameters
+    ----------
+    rate
+        Broadcasts per second.
+    """
+
+    async def broadcast_laser(bus: Bus) -> None:
+        laser = f"{LASER!r} in {BASE!r}"
+        say(f"broadcasting {laser} at {rate:g} Hz on {link.place}, until Ctrl-C")
+        await send_laser(bus, rate)
+
+    link.run(broadcast_laser)
+
+
+def listen(*, rate: Rate = 1.0, link: LinkOptions = DEFAULT_LINK) -> None:
+    """Print a point of the tutorial's laser in the frame of the base, again and again, until Ctrl-C.
+
+    Start `tfbus broadcast` in another terminal, before or after. Without it, the lines say what is missing.
+
+    Example: tfbus listen
+
+    Parameters
+    ----------
+    rate
+        Lines per second.
+    """
+
+    async def print_points(bus: Bus) -> None:
+        with Buffer(bus) as buffer:
+            await link.first_transform(bus)
+            await transform_points(buffer, rate, output=_print_fitted)
+
+    link.run(print_points, clock=ReplayClock())
+
+
+def demo(
+    *,
+    duration: Duration = float("inf"),
+    rate: Rate = 100.0,
+    listen_rate: Rate = 1.0,
+    backend: Backend = "asyncio",
+    simulated: Flag = False,
+    broadcaster: bool = True,
+) -> None:
+    """Run the tutorial's robot: a 100 Hz broadcaster and a 1 Hz listener in one process, until Ctrl-C.
+
+    Example: tfbus demo --simulated --duration 10
+
+    Parameters
+    ----------
+    duration
+        Stop after this many seconds.
+    rate
+        Broadcasts per second.
+    listen_rate
+        Lines per second.
+    backend
+        The event loop to run on.
+    simulated
+        Run on a simulated clock, as fast as possible.
+    broadcaster
+        Whether to run the broadcaster; without it, the listener says what is missing.
+    """
+    clock: Clock = SimulatedClock() if simulated else SystemClock()
+    robot = partial(
+        run_robot,
+        clock,
+        rate=rate,
+        listen_rate=listen_rate,
+        duration=duration,
+        broadcaster=broadcaster,
+        output=_print_fitted,
+    )
+    run(robot, backend)
+
+
+async def send_laser(bus: Bus, rate: float = 100.0) -> None:
     """Send the transform of the laser `rate` times a second, without drift and without end.
 
     A transform that the bus refuses, because it conflicts with those of other authorities, is logged once; the next one
@@ -38,7 +123,9 @@ async def broadcast(bus: Bus, rate: float = 100.0) -> None:
         broadcaster.send(BASE, LASER, BASE_FROM_LASER)
 
 
-async def listen(buffer: Buffer, rate: float = 1.0, *, lines: float = math.inf, output: Print = print) -> None:
+async def transform_points(
+    buffer: Buffer, rate: float = 1.0, *, lines: float = math.inf, output: Print = print
+) -> None:
     """Print the point in the base frame `rate` times a second, or the error; the first line comes after one period.
 
     Parameters
@@ -71,7 +158,7 @@ async def listen(buffer: Buffer, rate: float = 1.0, *, lines: float = math.inf, 
             return
 
 
-async def run(
+async def run_robot(
     clock: Clock,
     *,
     rate: float = 100.0,
@@ -98,10 +185,10 @@ async def run(
         start = clock.now()
         async with anyio.create_task_group() as tasks:
             if broadcaster:
-                tasks.start_soon(broadcast, bus, rate)
+                tasks.start_soon(send_laser, bus, rate)
             if isinstance(clock, SimulatedClock):
                 tasks.start_soon(_advance, clock)
-            await listen(buffer, listen_rate, lines=_ticks_within(duration, listen_rate), output=output)
+            await transform_points(buffer, listen_rate, lines=_ticks_within(duration, listen_rate), output=output)
             await clock.sleep(max(0.0, duration - to_seconds(clock.now() - start)))
             tasks.cancel_scope.cancel()
 
@@ -125,3 +212,7 @@ async def _advance(clock: SimulatedClock) -> None:
 def _ticks_within(duration: float, rate: float) -> float:
     # A duration of 0.3 s at 10 Hz is three ticks, although 0.3 * 10 < 3.
     return duration if math.isinf(duration) else math.floor(duration * rate + 1e-9)
+
+
+def _print_fitted(line: str) -> None:
+    print_now(fitted(line))

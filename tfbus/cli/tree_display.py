@@ -8,7 +8,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from tfbus.cli._width import cells, narrow_guides, shorten, terminal_width
+from tfbus.cli.output import cells, narrow_guides, shorten, terminal_width
 from tfbus.plain import printable
 from tfbus.stamps import SECOND
 from tfbus.tree.history import Edge

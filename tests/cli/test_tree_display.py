@@ -1,10 +1,12 @@
+"""The tree of frames as it is drawn."""
+
 import sys
 
 import pytest
 from support.terminal import Terminal
 
 from tfbus import SECOND, Edge
-from tfbus.cli._tree_display import TreeDisplay, tree_lines
+from tfbus.cli.tree_display import TreeDisplay, tree_lines
 from tfbus.tree.rendering import describe
 
 MOVING = Edge("map", "base_link", False, 101, 2 * SECOND, 4 * SECOND, "odometry")
@@ -48,18 +50,24 @@ def test_where_the_output_is_no_terminal_a_live_tree_is_printed_again_below_a_bl
     assert capsys.readouterr().out == 2 * "base_link\n└── lidar  static\n\n"
 
 
-def test_on_a_terminal_a_live_tree_is_redrawn_in_place_with_the_cursor_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("environment", [{}, {"NO_COLOR": "1"}])
+def test_on_a_terminal_a_live_tree_is_redrawn_in_place_with_the_cursor_shown_and_in_colour_unless_forbidden(
+    monkeypatch: pytest.MonkeyPatch, environment: dict[str, str]
+) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stdout", terminal)
-    monkeypatch.setenv("TERM", "xterm")
+    for name, value in ({"TERM": "xterm-256color", "NO_COLOR": ""} | environment).items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
     with TreeDisplay(live=True) as display:
         assert terminal.getvalue().endswith(SHOW_CURSOR)
-        display.show([STATIC], 0)
-        display.show([STATIC], 0)
+        display.show([MOVING], 0)
+        display.show([MOVING], 0)
     shown = terminal.getvalue()
-    assert shown.count("lidar") >= 2
+    assert shown.count("base_link") >= 2
     # The second drawing begins one line up, at the first of the two lines.
     assert "\x1b[1A" in shown
+    assert ("\x1b[36m" in shown) is not bool(environment)
     assert shown.rindex(SHOW_CURSOR) > shown.rindex(HIDE_CURSOR)
 
 
