@@ -527,6 +527,7 @@ async def test_a_moving_frame_moves_and_a_click_shows_where_it_is() -> None:
         await in_browser(steps)
 
 
+@look
 @on_one_loop
 async def test_stale_lost_and_new_frames_are_seen() -> None:
     shown = Shown()
@@ -555,6 +556,7 @@ async def test_stale_lost_and_new_frames_are_seen() -> None:
         await in_browser(steps)
 
 
+@look
 @on_one_loop
 async def test_a_recording_plays_to_its_end() -> None:
     tree = TransformTree(keep=None)
@@ -576,6 +578,7 @@ async def test_a_recording_plays_to_its_end() -> None:
             await in_browser(steps)
 
 
+@look
 @on_one_loop
 async def test_names_of_frames_are_texts_and_never_elements() -> None:
     evil = "<img src=x onerror=document.title='owned'>"
