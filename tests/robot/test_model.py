@@ -69,12 +69,6 @@ def test_fixed_joints_are_static_and_all_carry_stamp_authority_and_prefix() -> N
     assert samples[0].transform == Transform((0.0, 0.0, 1.0))
 
 
-def test_joints_without_a_position_are_left_out() -> None:
-    model = gripper(follower=Mimic("left"))
-    assert xs(model.transforms({}, 0)) == {}
-    assert xs(model.transforms({"third": 0.25}, 0)) == {"third": 0.25}
-
-
 def test_positions_of_fixed_and_of_unknown_joints_are_ignored() -> None:
     model = gripper()
     assert model.transforms({"mount": 9.0, "elbow": math.nan}, 0) == model.transforms({}, 0)

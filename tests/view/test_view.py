@@ -427,6 +427,12 @@ async def test_the_origins_that_may_use_the_page_are_named(caplog: pytest.LogCap
             async with httpx.AsyncClient(trust_env=False) as client:
                 assert (await client.get(view.address, headers={"Host": host})).status_code == status
         assert view.refused == 1
+
+        def steps(page: PageClient) -> None:
+            with PageClient(view.address, "http://robot.example") as other:
+                other.wait_until(lambda: other.nodes.keys() >= page.nodes.keys())
+
+        await on_page(view, steps)
     assert "evil.example" in caplog.text
 
 
