@@ -13,7 +13,7 @@ from support.samples import over, static, tree_of
 from tfbus import SECOND, Transform, TransformStamped, TransformTree
 from tfbus.errors import UnknownFrameError
 from tfbus.plot import Reception, plot_gaps, plot_path, plot_transforms
-from tfbus.plot.plots import line_styles, new_figure, show_in_window, spans_heard
+from tfbus.plot.plots import line_styles, show_in_window, spans_heard
 
 pytest.importorskip("matplotlib", reason="plots need matplotlib")
 
@@ -45,8 +45,6 @@ def test_the_lines_have_colours_of_their_own_and_a_legend() -> None:
     colours = [line.get_color() for line in axes.lines]
     assert colours == [colours[0]] * 3 + [colours[3]] * 3
     assert colours[0] != colours[3]
-    assert axes.xaxis.get_gridlines()[0].get_visible()
-    assert axes.get_adjustable() == "datalim"
 
 
 def test_an_instant_without_an_answer_is_neither_start_nor_end() -> None:
@@ -105,19 +103,11 @@ def test_the_figure_has_strips_periods_and_delays() -> None:
 def test_each_frame_has_a_row_and_each_axes_its_names_and_scale() -> None:
     figure = plot_gaps({"base": heard(10, 11, 12, 20, 21), "lidar": heard(static=True)})
     strips, periods, delays = figure.axes
-    assert figure.get_size_inches().tolist() == pytest.approx([11.0, 3.4])
     assert (strips.get_xlabel(), strips.get_ylim()) == ("time from the start [s]", (1.5, -0.5))
     assert strips.get_title() == "heard (static: dotted)"
     assert [np.asarray(line.get_ydata()).tolist() for line in strips.lines] == [[0, 0], [0, 0], [1, 1]]
-    heard_for, _, static = strips.lines
-    assert heard_for.get_linewidth() > static.get_linewidth() > 1.0
-    assert heard_for.get_color() != static.get_color()
-    # It must not look longer than it was.
-    assert heard_for.get_solid_capstyle() == "butt"
-    assert (strips.xaxis.get_gridlines()[0].get_visible(), strips.yaxis.get_gridlines()[0].get_visible()) == (1, 0)
     for axes, least, most in ((periods, 1_000.0, 8_000.0), (delays, 500.0, 500.0)):
         assert (axes.get_ylabel(), axes.get_yscale()) == ("samples", "log")
-        assert axes.xaxis.get_gridlines()[0].get_visible()
         full = [patch for patch in axes.patches if isinstance(patch, Rectangle) and patch.get_height()]
         assert full[0].get_x() - 1e-6 <= least <= full[0].get_x() + full[0].get_width() + 1e-6
         assert full[-1].get_x() - 1e-6 <= most <= full[-1].get_x() + full[-1].get_width() + 1e-6
@@ -217,12 +207,6 @@ def test_the_figure_is_drawn_and_then_shown(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 pytest.importorskip("matplotlib", reason="plots need matplotlib")
-
-
-def test_a_given_figure_is_drawn_in_and_otherwise_there_is_a_new_one() -> None:
-    figure = Figure()
-    assert new_figure(figure, 1.0, 2.0) is figure
-    assert new_figure(None, 3.0, 2.0).get_size_inches().tolist() == [3.0, 2.0]
 
 
 def test_no_two_of_28_lines_look_alike() -> None:

@@ -66,12 +66,6 @@ def test_a_prismatic_joint_slides_along_its_axis_and_does_not_rotate(
     assert moved.rotation == origin.rotation
 
 
-@given(transforms(10.0), st.floats(-10.0, 10.0), st.floats(-10.0, 10.0), angles())
-def test_a_planar_joint_about_z_is_x_y_and_yaw(origin: Transform, x: float, y: float, yaw: float) -> None:
-    expected = origin.matrix() @ shift(x, y, 0.0) @ turn((0.0, 0.0, 1.0), yaw)
-    assert_close(joint("planar", origin=origin).transform((x, y, yaw)), expected)
-
-
 @given(transforms(10.0), unit_vectors(), st.floats(-10.0, 10.0), st.floats(-10.0, 10.0), angles())
 def test_a_planar_joint_stays_in_its_plane_and_rotates_about_the_normal(
     origin: Transform, axis: Vector, x: float, y: float, angle: float

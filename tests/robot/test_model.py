@@ -1,6 +1,7 @@
 import copy
 import math
 import pickle
+import re
 from typing import Any
 
 import pytest
@@ -66,12 +67,6 @@ def test_fixed_joints_are_static_and_all_carry_stamp_authority_and_prefix() -> N
         "r1/left": False,
     }
     assert samples[0].transform == Transform((0.0, 0.0, 1.0))
-
-
-def test_joints_without_a_position_are_left_out() -> None:
-    model = gripper(follower=Mimic("left"))
-    assert xs(model.transforms({}, 0)) == {}
-    assert xs(model.transforms({"third": 0.25}, 0)) == {"third": 0.25}
 
 
 def test_positions_of_fixed_and_of_unknown_joints_are_ignored() -> None:
@@ -178,58 +173,46 @@ SEVERAL = [fixed("1", "a", "b"), fixed("2", "c", "d")]
         (["a", "/b"], [], "in <link name=\"/b\">: a frame name must not be empty or start with '/'"),
         (["a", ""], [], "in <link name=\"\">: a frame name must not be empty or start with '/'"),
         ("aa", [], 'in <link name="a">: there are 2 of this name'),
-        ("abc", [fixed("1", "a", "b"), fixed("1", "a", "c")], 'in <joint name="1">: there are 2 of this name'),
-        ("ab", [fixed("1", "x", "b")], "in <joint name=\"1\">: parent link 'x' is not there"),
-        ("ab", [fixed("1", "a", "y")], "in <joint name=\"1\">: child link 'y' is not there"),
-        (
-            "abc",
-            [fixed("1", "a", "c"), fixed("2", "b", "c")],
-            "in <joint name=\"2\">: link 'c' has two parents: 'a' by joint '1', and 'b'",
-        ),
+        ("abc", [fixed("1", "a", "b"), fixed("1", "a", "c")], "1: there are 2 of this name"),
+        ("ab", [fixed("1", "x", "b")], "1: parent link 'x' is not there"),
+        ("ab", [fixed("1", "a", "y")], "1: child link 'y' is not there"),
+        ("abc", [fixed("1", "a", "c"), fixed("2", "b", "c")], "2: link 'c' has two parents: 'a' by joint '1', and 'b'"),
         ("ab", [], "in <robot name=\"r\">: it has several roots: 'a', 'b'"),
         ("abcd", SEVERAL, "in <robot name=\"r\">: it has several roots: 'a', 'c'"),
-        ("a", [fixed("1", "a", "a")], "in <joint name=\"1\">: the links 'a' -> 'a' form a loop"),
+        ("a", [fixed("1", "a", "a")], "1: the links 'a' -> 'a' form a loop"),
         (
             "abc",
             [fixed("1", "a", "b"), fixed("2", "b", "c"), fixed("3", "c", "a")],
-            "in <joint name=\"3\">: the links 'a' -> 'c' -> 'b' -> 'a' form a loop",
+            "3: the links 'a' -> 'c' -> 'b' -> 'a' form a loop",
         ),
         (
             "abcd",
             [fixed("1", "c", "b"), fixed("2", "d", "c"), fixed("3", "c", "d")],
-            "in <joint name=\"2\">: the links 'c' -> 'd' -> 'c' form a loop",
+            "2: the links 'c' -> 'd' -> 'c' form a loop",
         ),
-        (
-            "ab",
-            [slide("1", "a", "b", mimic=Mimic("9"))],
-            "in <joint name=\"1\">: it mimics '9', which is not there",
-        ),
-        (
-            "ab",
-            [slide("1", "a", "b", mimic=Mimic("1"))],
-            "in <joint name=\"1\">: the joints '1' -> '1' mimic each other",
-        ),
+        ("ab", [slide("1", "a", "b", mimic=Mimic("9"))], "1: it mimics '9', which is not there"),
+        ("ab", [slide("1", "a", "b", mimic=Mimic("1"))], "1: the joints '1' -> '1' mimic each other"),
         (
             "abcd",
             [slide(name, "a", child, mimic=Mimic(leader)) for name, child, leader in ("1b2", "2c3", "3d2")],
-            "in <joint name=\"2\">: the joints '2' -> '3' -> '2' mimic each other",
+            "2: the joints '2' -> '3' -> '2' mimic each other",
         ),
         (
             "abc",
             [Joint("1", "floating", "a", "b"), slide("2", "a", "c", mimic=Mimic("1"))],
-            "in <joint name=\"2\">: it mimics '1', but '1' is floating: only one number can be mimicked",
+            "2: it mimics '1', but '1' is floating: only one number can be mimicked",
         ),
         (
             "abc",
             [Joint("1", "planar", "a", "b", mimic=Mimic("2")), slide("2", "a", "c")],
-            "in <joint name=\"1\">: it mimics '2', but '1' is planar: only one number can be mimicked",
+            "1: it mimics '2', but '1' is planar: only one number can be mimicked",
         ),
     ],
 )
 def test_an_invalid_robot_is_refused_with_the_element(links: Any, joints: list[Joint], message: str) -> None:
     with pytest.raises(InvalidRobotError) as caught:
         RobotModel("r", links, joints)
-    assert str(caught.value) == message
+    assert str(caught.value) == re.sub(r"^([0-9]): ", r'in <joint name="\1">: ', message)
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=2, max_size=4))

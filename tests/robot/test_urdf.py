@@ -297,8 +297,8 @@ def test_every_shape_is_read(text: str, shape: Box | Cylinder | Sphere | Mesh) -
 
 
 def test_a_visual_has_the_origin_of_its_shape() -> None:
-    [visual] = read_visuals(shaped('<sphere radius="1"/>', '<origin xyz="1 2 3" rpy="0 0 0.5"/>'))
-    assert visual.origin.is_close(Transform.from_xyz_rpy((1, 2, 3), (0, 0, 0.5)))
+    [visual] = read_visuals(shaped('<sphere radius="1"/>', '<origin xyz="1 2 3" rpy="0.1 -0.2 0.3"/>'))
+    assert visual.origin.is_close(Transform.from_xyz_rpy((1, 2, 3), (0.1, -0.2, 0.3)))
 
 
 def test_the_colour_is_its_own_or_that_of_the_material_it_names() -> None:

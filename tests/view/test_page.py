@@ -93,12 +93,6 @@ def test_the_fixed_frame_is_the_root_of_the_largest_tree_until_one_is_chosen() -
     assert page.fixed == "map"
 
 
-def test_a_fixed_frame_that_is_not_known_draws_nothing_and_says_so() -> None:
-    page = Page(driven(), fixed="mop")
-    assert page.picture(0).scene.frames == ()
-    assert "the fixed frame 'mop' is not known" in unescape(texts(page).status)
-
-
 def test_a_page_without_frames_waits() -> None:
     page = Page(TransformTree())
     assert page.picture(0).scene.frames == ()
@@ -337,14 +331,6 @@ def test_the_pose_is_in_m_degrees_and_a_quaternion_with_w_last() -> None:
         "delay": "250 ms",
         "authority": "odometry",
     }
-
-
-def test_the_pose_is_that_of_the_chosen_stamp() -> None:
-    tree = tree_of(*over("map", "a", (0, SECOND), speed=1e-9))
-    facts = selection_facts(tree, "map", "a", SECOND // 4, SECOND)
-    assert facts["xyz"] == "0.250000 0.000000 0.000000 m"
-    assert facts["at"] == "0.250 s"
-    assert facts["rate"] == "1.0 Hz"
 
 
 def test_a_frame_without_a_pose_says_why_and_keeps_the_other_facts() -> None:

@@ -13,8 +13,7 @@ import msgspec
 from support.viser_pages import CAMERA, CLICK, PageClient, viser_page
 from websockets.exceptions import InvalidMessage, InvalidStatus
 
-from tfbus._aio.web_door import WebDoor
-from tfbus.view.server import MAX_CONNECTIONS, MAX_MESSAGE, MAX_TEXT, Server, start_server, stop_server
+from tfbus.view.server import MAX_CONNECTIONS, MAX_MESSAGE, MAX_TEXT, Server, start_server
 
 
 def browser(server: Server, origin: str | None = None) -> PageClient:
@@ -54,17 +53,6 @@ def test_pages_of_other_sites_and_other_names_get_nothing() -> None:
             answer = httpx.get(f"http://127.0.0.1:{port}", headers={"Host": host}, trust_env=False)
             assert answer.status_code == status
         assert server.door.refused == 6
-
-
-def test_another_site_that_the_user_names_may_use_the_page() -> None:
-    server = start_server("127.0.0.1", 0, WebDoor("127.0.0.1", ["https://robot.example"]))
-    try:
-        with browser(server, "https://robot.example") as client:
-            assert client.socket.recv(timeout=30.0)
-        with pytest.raises(InvalidStatus, match="403"), browser(server, "https://evil.example"):
-            pytest.fail("connected")
-    finally:
-        stop_server(server)
 
 
 def test_a_head_that_comes_in_pieces_is_judged_and_one_without_an_end_is_refused() -> None:

@@ -427,6 +427,12 @@ async def test_the_origins_that_may_use_the_page_are_named(caplog: pytest.LogCap
             async with httpx.AsyncClient(trust_env=False) as client:
                 assert (await client.get(view.address, headers={"Host": host})).status_code == status
         assert view.refused == 1
+
+        def steps(page: PageClient) -> None:
+            with PageClient(view.address, "http://robot.example") as other:
+                other.wait_until(lambda: other.nodes.keys() >= page.nodes.keys())
+
+        await on_page(view, steps)
     assert "evil.example" in caplog.text
 
 
@@ -527,6 +533,7 @@ async def test_a_moving_frame_moves_and_a_click_shows_where_it_is() -> None:
         await in_browser(steps)
 
 
+@look
 @on_one_loop
 async def test_stale_lost_and_new_frames_are_seen() -> None:
     shown = Shown()
@@ -555,6 +562,7 @@ async def test_stale_lost_and_new_frames_are_seen() -> None:
         await in_browser(steps)
 
 
+@look
 @on_one_loop
 async def test_a_recording_plays_to_its_end() -> None:
     tree = TransformTree(keep=None)
@@ -576,6 +584,7 @@ async def test_a_recording_plays_to_its_end() -> None:
             await in_browser(steps)
 
 
+@look
 @on_one_loop
 async def test_names_of_frames_are_texts_and_never_elements() -> None:
     evil = "<img src=x onerror=document.title='owned'>"

@@ -55,7 +55,7 @@ class Arrival:
     static : bool
         Whether the newest sample is static; such a frame is not measured.
     samples : int
-        Those in the window.
+        The samples in the window.
     rate : float or None
         Arrivals a second.
     delay_mean, delay_p99, delay_max : float or None

@@ -249,7 +249,7 @@ def _nearest(short: _Stamps, long: _Stamps, limit: int) -> tuple[npt.NDArray[np.
     if after is None:
         best = np.zeros(len(short), np.intp)
     else:
-        # Of two that are equally near, the earlier one.
+        # The earlier one of two that are equally near.
         nearer = time_between(short, long[after]) < time_between(long[after - 1], short)
         best = np.where(nearer, after, after - 1)
     near = np.flatnonzero(np.abs(time_between(short, long[best])) <= limit)

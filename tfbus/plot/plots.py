@@ -1,4 +1,8 @@
-"""`plot_transforms`, which draws x, y, z and roll, pitch, yaw over time."""
+"""Plots of recordings with matplotlib, and a `Series` as lines of letters for terminals.
+
+`plot_transforms` draws x, y, z and roll, pitch, yaw over time, `plot_path` a path from above or in space, `plot_gaps`
+when each frame was heard, with its periods and delays.
+"""
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence

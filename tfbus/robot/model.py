@@ -1,4 +1,10 @@
-"""`RobotModel`, a robot as a tree of links and joints."""
+"""`RobotModel`, a robot as a tree of links and joints, and the reader of URDF, which describes robots.
+
+A `Joint` gives the pose of its child link for a position; a `RobotModel` gives the samples of all joints.
+urdf-parser-py interprets the elements of a URDF, but prints a complaint to standard error for each unknown one, and
+fails at the legacy transmissions of real robots. So it gets one element at a time, reduced to the parts that it knows.
+The XML itself is parsed here, with limits, because files may come from untrusted sources.
+"""
 
 import math
 import os
@@ -231,13 +237,6 @@ def _from_z(axis: Vector) -> Quaternion:
     w = 1.0 + z if z > 0.0 else (x * x + y * y) / (1.0 - z)
     norm = math.hypot(x, y, w)
     return (-y / norm, x / norm, 0.0, w / norm) if norm else (1.0, 0.0, 0.0, 0.0)
-
-
-# Reading URDF, the description of a robot as links and joints.
-#
-# urdf-parser-py interprets the elements, but prints a complaint to standard error for each unknown one, and fails at
-# the legacy transmissions of real robots. So this module passes it one element at a time, reduced to the parts that it
-# knows. The XML itself is parsed here, with limits, because files may come from untrusted sources.
 
 
 MAX_DEPTH = 100
@@ -775,7 +774,7 @@ class RobotModel:
         return moving
 
     def violations(self, positions: Mapping[str, Position]) -> list[LimitViolation]:
-        """The joints whose positions are outside of their limits, including those that mimic another.
+        """The joints whose positions are outside of their limits; joints that mimic another count too.
 
         Raises
         ------
@@ -797,7 +796,7 @@ class RobotModel:
         return [name for name in names if name not in self._names]
 
     def zeros(self) -> dict[str, Position]:
-        """The zero position of every moving joint, without those that mimic another."""
+        """The zero position of every moving joint that mimics no other."""
         return {joint.name: joint.zero for joint in self.joints if joint.kind != "fixed" and joint.mimic is None}
 
 

@@ -1,7 +1,7 @@
 """The live 3D page: a `View` serves a page on which people see the frames of a buffer and move through its history.
 
-What a picture shows is decided without a browser and without an event loop (page, scene, timeline); the canvas and the
-panel draw it with viser. Needs ``pip install "tfbus[view]"``.
+`page` decides without a browser and without an event loop what a picture shows; `screen` draws it with viser, which
+`server` starts behind a door. Needs ``pip install "tfbus[view]"``.
 """
 
 from tfbus.errors import pip_install

@@ -259,7 +259,7 @@ def _unpacked(data: bytes) -> bytes:
         if not scenes:
             raise ValueError("its archive has no .dae")
         with archive.open(scenes[0]) as file:
-            # What the archive says of the size may be wrong.
+            # The archive may tell a wrong size.
             unpacked = file.read(MAX_BYTES + 1)
     _check(len(unpacked), MAX_BYTES, "bytes, unpacked")
     return unpacked

@@ -141,7 +141,7 @@ class Canvas:
         """Bring the browsers to a picture, with axes of a length in m."""
         scene, drawn = picture.scene, self._drawn
         self._draw_frames(scene, axes_length)
-        # What stays is not given to viser, which would compare it number by number.
+        # viser would compare arrays that stay number by number.
         self._lines.points = scene.lines
         if scene.line_colours is not drawn.scene.line_colours:
             self._lines.colors = scene.line_colours
@@ -346,7 +346,7 @@ class Panel:
 
     def _callback(self, choose: Callable[[Any], object]) -> Callable[[Any], Awaitable[None]]:
         async def used(event: Any) -> None:
-            # What the program itself sets has no client.
+            # A value that the program itself sets has no client.
             if event.client_id is not None:
                 value = event.target.value
                 self._controls.use(id(event.target), lambda: choose(value))

@@ -73,7 +73,7 @@ class _Camera(_Sent, tag="ViewerCameraMessage"):
 
 
 class _Messages:
-    """Reads the messages of browsers, in viser's thread; those that the page does not send become nothing."""
+    """Reads the messages of browsers, in viser's thread; a message that the page does not send becomes nothing."""
 
     def __init__(self, server: "Server", reader: Any) -> None:
         self._server = server
@@ -338,7 +338,7 @@ CAPACITY = 12
 
 
 class Controls:
-    """What people did on the page since it was drawn last; of each control, the newest value counts.
+    """The changes that people made on the page since it was drawn last; of each control, the newest value counts.
 
     It belongs to viser's thread: viser calls `use` there, and the page is changed there when it is drawn. So a flood
     of messages costs the program's event loop one wake-up a picture, whatever they change.

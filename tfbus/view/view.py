@@ -62,8 +62,8 @@ class View:
     port : int
         Where to serve the page: this port, or the next one that is free; 0 for any.
     host : str
-        The address to listen at. By default, only programs on this machine can connect; whoever can connect sees and
-        controls the page.
+        The address to listen at. By default, only programs on this machine can connect; each program that can connect
+        sees and controls the page.
     origins : iterable of str
         Web pages that may use this one beside itself, such as ``https://robot.example:8443``; the page answers to the
         names of their hosts too. By default there are none, and it answers to addresses, to ``localhost``, to ``host``
@@ -161,7 +161,7 @@ class View:
         size: float = 0.02,
         colour: Any = (86, 180, 233),
     ) -> None:
-        """Show points in their frame, instead of those that had the same name.
+        """Show points in their frame, instead of earlier points of the same name.
 
         Points with a stamp are where their frame was then, seen from the fixed frame; those with the stamp `LATEST`
         move with their frame. They are hidden until there is a transform.
@@ -230,7 +230,7 @@ class View:
         self._drawn_waker.bind()
         fixed, trails, live, stale_after = self._page_options
         self._page = Page(self._buffer.tree, fixed, trails, live, stale_after)
-        # What a thread has started must not be lost to a cancellation.
+        # A cancellation must not lose the server that a thread has started.
         with anyio.CancelScope(shield=True):
             solids = await anyio.to_thread.run_sync(self._read_solids)
             server = self._server = await anyio.to_thread.run_sync(start_server, self._host, self._port, self._door)
@@ -349,7 +349,7 @@ class View:
         with ExitStack() as stack:
             if not self.bus.closed:
                 stack.enter_context(self.bus.subscribe(arrived, removed))
-                # Those that are latched arrived at another time.
+                # Latched samples arrived at another time.
                 delays.by_frame.clear()
             yield
 
