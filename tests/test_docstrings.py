@@ -20,6 +20,11 @@ EXAMPLES = ["Bus", "Buffer", "Transform", "TransformArray", "TransformBroadcaste
 QUESTION = re.compile(r'^ *r?"""(?:What|Where|How|Who|Whom|Whose|Which|Why|When)(?:ever)?\b.*', re.MULTILINE)
 
 
+NO_SUBJECT = re.compile(
+    r'^ *(?:"""|# )(?:What|Whatever|Who|Whoever|Whom|Those (?:that|who|of|in|with)|That of|Of which)\b.*', re.MULTILINE
+)
+
+
 @pytest.fixture
 def recordings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run an example in the folder of the recordings, which it reads by name."""
@@ -83,4 +88,10 @@ def test_no_docstring_opens_with_a_question_word() -> None:
     ]
     assert len(paths) > 100
     found = {str(path): QUESTION.findall(path.read_text(encoding="utf-8")) for path in paths}
+    assert {path: lines for path, lines in found.items() if lines} == {}
+
+
+def test_no_sentence_of_the_package_opens_with_a_clause_that_hides_its_subject() -> None:
+    paths = [*Path(tfbus.__file__).parent.rglob("*.py")]
+    found = {str(path): NO_SUBJECT.findall(path.read_text(encoding="utf-8")) for path in paths}
     assert {path: lines for path, lines in found.items() if lines} == {}

@@ -1,4 +1,4 @@
-"""Which files are recordings, which topics of them are read, and what is told about the rest."""
+"""The files that are recordings, the topics of them that are read, and the reports about the rest."""
 
 import errno
 import gzip

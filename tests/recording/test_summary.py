@@ -1,4 +1,4 @@
-"""What a recording holds in numbers, and what is suspicious in it."""
+"""The numbers of a recording, and the suspicions about it."""
 
 import dataclasses
 import pickle

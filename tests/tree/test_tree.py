@@ -425,6 +425,19 @@ def test_a_copy_is_independent_and_keeps_the_windows_and_the_senders() -> None:
     assert {edge.child: edge.samples for edge in tree.edges()} == {"base": 11, "lidar": 1}
 
 
+@pytest.mark.parametrize("below", [False, True])
+def test_after_a_clear_an_edge_may_be_reversed(below: bool) -> None:
+    tree = tree_of(moving("map", "base", 0, 5.0))
+    if below:
+        tree.insert(moving("world", "map", 0))
+    assert x_of(tree, "map", "base") == 5.0
+    tree.clear()
+    tree.insert(moving("base", "map", 1, -2.0))
+    assert x_of(tree, "base", "map") == -2.0
+    assert x_of(tree, "map", "base", 1) == 2.0
+    assert tree.parent("base") is None
+
+
 def test_a_cleared_frame_stays_known_in_a_copy() -> None:
     tree = tree_of(moving("map", "base", 1, authority="odometry"))
     tree.clear()

@@ -140,7 +140,7 @@ class Endpoint:
     def tell_time(self, stamp: int) -> None:
         """Tell peers the time of this bus's clock, in ns, with all that is published from now on."""
         if self.outbox.time is not None and stamp < self.outbox.time:
-            # What was published before the jump is of the time before it.
+            # Samples that were published before the jump are of the time before it.
             self.send()
         self.outbox.tell_time(stamp)
 
@@ -158,7 +158,7 @@ class Endpoint:
             self._claimed_at = self._now()
             self._claim_period = min(2 * self._claim_period, LONGEST_CLAIM_PERIOD)
             due = self._claimed_at + self._claim_period
-            # Those that this link does not hear may hear it.
+            # Peers that this link does not hear may hear it.
             if not self.outbox.pending:
                 self._askable.claim(self.outbox.step())
         asking = self.next_question()

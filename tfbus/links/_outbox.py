@@ -104,7 +104,7 @@ class Outbox:
             self._kept.remove(frame)
             # A peer that is lost here may be present elsewhere, so its loss is no tombstone for others.
             self._changes[frame] = None if echo and removal.lost else removal
-        # Those that hear of it by the link which brought the removal are told by that one.
+        # The link that brought the removal tells the peers that hear of it by that link.
         if brought or not echo:
             self._change(frame, removal, echo)
         if kept or brought or not echo:
@@ -131,7 +131,7 @@ class Outbox:
 
     def step(self) -> StateStep:
         """The changes of the state since the last turn."""
-        # What no entry tells has to be asked for.
+        # A peer asks for the removals that no entry tells.
         since = self.state.number if self._silent else self._told
         return StateStep(since, self.state.number, self.state.digest)
 

@@ -43,7 +43,7 @@ class PassedSamples:
         elif child in self._gone:
             del self._gone[child]
         key = parent, stamp, row if static else None
-        # What passes again is as new as any.
+        # A sample that passes again is as new as any.
         known.pop(key, None)
         known[key] = None
         if len(known) > self._per_child:

@@ -338,7 +338,7 @@ class Relay:
         self._forget_frame(frame, provenance)
         removal = RemovedFrame(provenance.origin, provenance.sequence, frame, provenance.lost)
         for outbox in self._outboxes:
-            # Those who brought it as well have to hear that it was taken from somebody else.
+            # The other links that brought it have to hear that it was taken from somebody else.
             asks = lost_static and self._brings[outbox](frame, provenance.peer)
             outbox.add_removal(removal, echo=outbox is provenance.outbox and not asks)
 
@@ -346,7 +346,7 @@ class Relay:
         self._settled.pop(frame, None)
         self._losses_passed_on.pop(frame, None)
         if self._passed is not None:
-            # What is lost may come again just as it was.
+            # A lost sample may come again just as it was.
             (self._passed.forget if provenance.lost else self._passed.retire)(frame)
         if not provenance.lost:
             self._removals.remove(frame, provenance)

@@ -71,7 +71,7 @@ class Removals:
         """Whether a sample of a frame that is not there comes too late."""
         gone = self._gone.get((provenance.origin, frame))
         if gone is None:
-            # What is kept for late joiners holds now, however old it is.
+            # A sample that is kept for late joiners holds now, however old it is.
             return provenance.live and provenance.sequence <= self._late_up_to.get(provenance.origin, -1)
         if gone.sequence == provenance.sequence and gone.lost_at is not None and provenance.peer is not None:
             return provenance.peer.age < gone.lost_at and provenance.peer.id != gone.told_by

@@ -133,7 +133,7 @@ class FoxgloveServer:
         self.bus._entered.add(self)
         self._never_entered.detach()
         self._waker.bind()
-        # What a thread has started must not be lost to a cancellation.
+        # A cancellation must not lose a server that a thread has started.
         with anyio.CancelScope(shield=True):
             try:
                 self._front = await anyio.create_tcp_listener(local_host=self._host, local_port=self._port)
@@ -183,7 +183,7 @@ class FoxgloveServer:
                     name="tfbus", host=host, port=0, server_listener=self._listener, context=context
                 )
             except RuntimeError as error:
-                # What the library raises for whatever the system says.
+                # The library raises this for any error of the system.
                 failure = error
             else:
                 self._inside = host, server.port

@@ -144,7 +144,7 @@ class Link:
         self._send_report = SendReport(self._warn_not_sent)
         self._receive_queue = ReceiveQueue(capacity)
         self._split = carrier.split if isinstance(carrier, SplittingCarrier) else None
-        # What is left of a large message, and the item that has brought it.
+        # The rest of a large message, and the item that has brought it.
         self._parts: Iterator[Any] = iter(())
         self._whole: Received | None = None
         self._budget = TurnBudget(now=now)

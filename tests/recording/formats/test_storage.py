@@ -1,4 +1,4 @@
-"""What all formats share: selection, merging, packing and unfolding within bounds."""
+"""The parts that all formats share: selection, merging, packing and unfolding within bounds."""
 
 import bz2
 import io

@@ -247,7 +247,7 @@ class DdsCarrier(RosCarrier):
             return False
         return True
 
-    # What follows is called in the thread of the readers.
+    # The thread of the readers calls the methods below.
 
     def _take(self, static: bool, reader: DataReader[RawTFMessage]) -> bool:
         return self._take_each(reader, partial(self._take_transforms, static, reader))

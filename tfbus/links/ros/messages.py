@@ -190,7 +190,7 @@ def decode_text(content: Any) -> str:
         If it holds none.
     """
     if isinstance(content, bytes):
-        # That of ROS 1 is its length and as many bytes; that of ROS 2 has a header, and a zero at the end.
+        # A text of ROS 1 is its length and as many bytes; one of ROS 2 has a header, and a zero at the end.
         if len(content) >= _SIZE and struct.unpack_from("<I", content)[0] == len(content) - _SIZE:
             return _as_text(content[_SIZE:])
         order = _HEADERS.get(content[:2])

@@ -205,7 +205,7 @@ class RosCarrier:
             error = MalformedMessageError("oversized", f"{size} bytes, more than {MAX_SIZE}")
             self._receive(Received(sender, error))
         else:
-            # What is latched comes once.
+            # A latched message comes once.
             moving = not (message.static or message.description)
             self._receive(Received(sender, message, size, moving=moving))
 

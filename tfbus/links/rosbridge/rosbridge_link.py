@@ -272,7 +272,7 @@ class RosbridgeCarrier(RosCarrier):
 
     async def _talk(self, socket: WebSocket) -> None:
         """Send and receive until the server is gone."""
-        # What is being sent when the link ends goes out whole, or later messages could not be read.
+        # A message that is being sent when the link ends goes out whole, or later ones could not be read.
         self._writing, self._ending = anyio.CancelScope(shield=True), False
         tasks = anyio.create_task_group()
         await tasks.__aenter__()
@@ -336,7 +336,7 @@ class RosbridgeCarrier(RosCarrier):
         for kind, topics in others.items():
             if incoming.topic in topics:
                 other = RosMessage(incoming.content, static=False, authority="", **{kind: True})
-                # What is latched comes once.
+                # A latched message comes once.
                 self._receive(Received(self._url, other, size, moving=kind != "description"))
                 return
         static = incoming.topic in self.settings.tf_static

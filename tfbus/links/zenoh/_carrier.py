@@ -151,7 +151,7 @@ class ZenohCarrier:
         try:
             return self._sessions.is_heard()
         except zenoh.ZError:
-            # What is sent fails as well, and that is reported.
+            # Sending fails as well, and that is reported.
             return True
 
     def _serve_filters(self) -> None:

@@ -184,7 +184,7 @@ class Introductions:
             raise MalformedMessageError("introduction", f"{foreign} lines of an answer name no link or no address")
 
     def _useful(self, addresses: Iterable[str]) -> list[str]:
-        """Those of some addresses that are well formed, and lead to the same machine for others."""
+        """The well-formed addresses among some that lead to the same machine for others."""
         valid = [address for address in islice(addresses, MOST_ADDRESSES) if _is_address(address)]
         return [address for address in valid if self._listening.is_local or not is_on_this_machine(address)]
 

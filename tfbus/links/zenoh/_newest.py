@@ -101,7 +101,7 @@ class Thinning:
     def takes(self, sender: str) -> bool:
         """Whether a message that has come now is taken."""
         now = self._now()
-        # What belongs together comes in several messages at once.
+        # Samples that belong together come in several messages at once.
         since = now - self._taken.get(sender, -math.inf)
         if _TOGETHER < since < _EARLY * self._period:
             return False

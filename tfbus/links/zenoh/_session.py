@@ -141,7 +141,7 @@ class ZenohSession:
         self._close_at_exit = weakref.finalize(self, close_session, session)
         remote, keys = zenoh.Locality.REMOTE, self._keys
         self.publishers = Publishers(session, keys)
-        # Whoever sees the token can ask at once. zenoh undeclares a token that nobody refers to.
+        # A peer that sees the token can ask at once. zenoh undeclares a token that nobody refers to.
         self._declared = [
             *(
                 session.declare_subscriber(key, self._door(self._receive_live), allowed_origin=remote)
@@ -263,7 +263,7 @@ class ZenohSession:
             if not answered:
                 take(None, b"")
 
-        # What cannot be asked is asked again.
+        # A question that cannot be sent is sent again.
         with suppress(zenoh.ZError):
             self.session.get(
                 self._key("hears", peer),
@@ -393,7 +393,7 @@ class ZenohSession:
     def _admit(self, question: Question | HistoryQuestion) -> None:
         with self._lock:
             if len(self._questions) >= MOST_QUESTIONS:
-                # Whoever means it asks again.
+                # A peer that means it asks again.
                 raise MalformedMessageError("busy", f"{MOST_QUESTIONS} questions wait for answers")
             self._questions.add(question.handle)
         self._receive(Received("", question))

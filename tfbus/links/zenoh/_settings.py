@@ -115,7 +115,7 @@ def identity(listen: Addresses | None, connect: Addresses | None, config: Mappin
     )
     id = bytearray(os.urandom(16))  # noqa: A001 - zenoh calls it so
     for place in (0, -1):
-        # Whatever the order of bytes. An id must not begin with 0.
+        # For any order of bytes. An id must not begin with 0.
         id[place] = 0xC0 | id[place] if on_loopback else 0x80 | id[place] & 0x3F
     own_settings: dict[str, Any] = {"id": id.hex()}
     if on_loopback:

@@ -112,7 +112,7 @@ class Unmet:
 
 
 def find_deaf(own: ZenohSession, keys: Keys, sessions: Iterable[tuple[str, list[str]]]) -> list[tuple[str, str]]:
-    """Those of some sessions that may be links which this one ought to hear, with each address to dial; blocks.
+    """The sessions to dial, with addresses, because they may be links that this one ought to hear. Blocks.
 
     Parameters
     ----------
