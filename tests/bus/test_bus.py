@@ -652,3 +652,12 @@ def test_an_interrupt_in_one_buffer_keeps_the_batch_from_no_other_nor_from_a_sub
 def test_an_unknown_policy_for_conflicts_is_an_error() -> None:
     with pytest.raises(ValueError, match="on_conflict must be 'last' or 'reject', not 'first'"):
         Bus(on_conflict="first")  # type: ignore[arg-type]
+
+
+def test_a_stranger_cannot_flood_the_log_with_names(caplog: pytest.LogCaptureFixture) -> None:
+    with Bus() as bus:
+        bus.publish([moving("map", f"frame{number}", 1) for number in range(2_000)])
+        assert bus.statistics().behind == 2_000
+    about = [message for message in caplog.messages if "behind the clock" in message]
+    assert 0 < len(about) < 200
+    assert sum("the others are left out" in message for message in caplog.messages) == 1

@@ -14,6 +14,7 @@ BOUNDS = [
     "rows.NORM_TOLERANCE",
     "bus.subscribers._QUEUED_BATCHES",
     "bus.subscribers._KEPT",
+    "bus.subscribers.LINES",
     "bus.event_stream._REFUSED_FRAMES",
     "bus.event_stream._CLAIMS",
     "buffer.lookups.REPORT_AFTER",

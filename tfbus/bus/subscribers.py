@@ -1,6 +1,7 @@
 """The callbacks of a bus, the announcement of its events, and log lines that are written once for each cause."""
 
 import logging
+import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from inspect import iscoroutinefunction
@@ -13,6 +14,11 @@ from tfbus.plain import printable
 from tfbus.registration import Registration
 
 _KEPT = 1_000
+
+LINES = 100
+"""The number of log lines of one kind that are written in a minute."""
+
+_MINUTE = 60.0
 
 
 class SeenKeys:
@@ -46,13 +52,16 @@ class SeenKeys:
 class OnceLogger:
     """Writes a log line the first time that its key is seen; the last thousand keys are kept.
 
-    A line that repeats at 100 Hz buries all others. Callers count the repetitions. Names and errors of strangers may be
-    arguments as they are: none of them begins a line of its own.
+    A line that repeats at 100 Hz buries all others, and so do the lines about ten thousand frames of a stranger: in a
+    minute, `LINES` of one kind are written. Callers count each case. Names and errors of strangers may be arguments as
+    they are: none of them begins a line of its own.
     """
 
     def __init__(self, logger: logging.Logger) -> None:
         self._logger = logger
         self._seen = SeenKeys()
+        # The beginning of a minute (s), and the number of lines since, by kind.
+        self._written: dict[str, tuple[float, int]] = {}
 
     def info(self, key: Hashable, message: str, *args: object) -> None:
         """Log at the level INFO, unless `key` was seen."""
@@ -65,7 +74,16 @@ class OnceLogger:
     def _log(
         self, level: int, key: Hashable, message: str, args: tuple[object, ...], exc_info: BaseException | None
     ) -> None:
-        if self._seen.add(key):
+        if not self._seen.add(key):
+            return
+        now = time.monotonic()
+        began, lines = self._written.get(message, (now, 0))
+        if now - began >= _MINUTE:
+            began, lines = now, 0
+        self._written[message] = began, lines + 1
+        if lines == LINES:
+            self._logger.warning("more than %d lines in a minute, the others are left out, such as: %s", LINES, message)
+        elif lines < LINES:
             shown = (arg if isinstance(arg, (int, float)) else _Printable(arg) for arg in args)
             self._logger.log(level, message, *shown, exc_info=exc_info)
 
