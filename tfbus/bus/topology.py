@@ -39,7 +39,7 @@ from tfbus.stamps import (
     likely_cause,
 )
 from tfbus.tree.cycles import NewestEdge, admit, changed_parents
-from tfbus.tree.known_frames import KnownFrames
+from tfbus.tree.forest import KnownFrames
 from tfbus.which_kernel import Edge, Judge
 
 
