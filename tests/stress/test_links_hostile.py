@@ -182,7 +182,7 @@ def test_a_thousand_tokens_are_a_thousand_peers_and_go_with_their_session(scene:
     stranger.send(moving("map", "last", 1), key=f"{stranger.prefix}/~/live/{known}")
     scene.victim.ask("until", has=["last"], peers=MAX_PEERS)
     scene.victim.ask("until", peers=MAX_PEERS)
-    scene.check_announced("key", "too many peers")
+    scene.check_announced("key", "too many tokens")
     stranger.session.close()
     scene.victim.ask("until", peers=1)
     assert len(tokens) == len(names)
