@@ -371,7 +371,8 @@ from tfbus import Bus
 from tfbus.links.zenoh import ZenohLink
 
 async def main():
-    with Bus() as bus, bus.stream() as batches:
+    # The broadcaster's stamps are of another time.
+    with Bus(max_behind=None) as bus, bus.stream() as batches:
         async with ZenohLink(bus, {place.domain!r}, connect={place.addresses[0]!r}):
             async for batch in batches:
                 print("ready", flush=True)

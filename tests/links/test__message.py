@@ -149,7 +149,8 @@ def test_a_full_message_is_followed_by_another_and_batches_stay_whole() -> None:
     writer.add(*[moving("map", "b", stamp) for stamp in range(FULL_MESSAGE - 2)])
     writer.add(*[moving("map", "c", stamp) for stamp in range(2 * FULL_MESSAGE)])
     writer.add(moving("map", "d", 1))
-    assert shapes(writer.write()) == [[1] * FULL_MESSAGE, [1, FULL_MESSAGE - 2, 2 * FULL_MESSAGE], [1]]
+    # The batch of c fills a message of its own, for no message has more than twice as many samples.
+    assert [message.samples for message in writer.write()] == [FULL_MESSAGE, 1, FULL_MESSAGE - 2, 2 * FULL_MESSAGE, 1]
 
 
 def test_removals_count_as_samples_do() -> None:
