@@ -66,6 +66,7 @@ BOUNDS = [
     "links.rosbridge.rosbridge_link.SILENCE",
     "links.rosbridge.rosbridge_link.MOST_SAID",
     "links.rosbridge.protocol.MAX_VALUE",
+    "links.rosbridge.protocol.MAX_TEXT",
     "links.rosbridge.protocol.MOST_TRANSFORMS",
     "links.rosbridge.protocol.QUEUE",
     "links.dds.dds_link._DEPTH",

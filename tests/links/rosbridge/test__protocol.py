@@ -179,6 +179,16 @@ async def test_what_costs_a_decoder_more_than_its_bytes_is_refused_in_small_and_
         await read_large(enveloped(b"\xa1\x6atransforms" + rows), anyio.lowlevel.checkpoint)
 
 
+@asynchronous
+async def test_a_text_of_json_is_read_up_to_its_bound() -> None:
+    def message(size: int) -> str:
+        return json.dumps({"op": "status", "level": "error", "msg": "x" * size})
+
+    assert (await read_large(message(3 * 2**20 - 2), anyio.lowlevel.checkpoint)) is not None
+    with pytest.raises(MalformedMessageError, match="encoding"):
+        await read_large(message(3 * 2**20 - 1), anyio.lowlevel.checkpoint)
+
+
 def large_message(count: int, encoding: str, last: bool = False) -> str | bytes:
     fields = {"transforms": [as_mapping(moving("map", f"frame{number}", number)) for number in range(count)]}
     message: dict[str, Any] = {"op": "publish", "topic": "/tf", "msg": fields}
