@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.transform import Transform, from_row
-from tfbus.rows import NORM_TOLERANCE, ROUNDING, Columns, Row, compose, invert, rotate
+from tfbus.rows import NORM_TOLERANCE, ROUNDING, Columns, compose, invert, rotate
 from tfbus.stamps import StampsLike, as_array, as_stamps, format_stamp
 
 
@@ -341,11 +341,6 @@ class TransformArray:
         return from_columns, (self._columns, self._policy_use, self._stamps)
 
 
-def from_rows(rows: list[Row]) -> TransformArray:
-    """The transforms of valid rows."""
-    return from_columns(np.array(rows).T if rows else np.empty((7, 0)))
-
-
 def from_columns(columns: Floats, policy_use: Integers | None = None, stamps: Integers | None = None) -> TransformArray:
     """The transforms of valid columns, without a copy.
 
@@ -362,13 +357,6 @@ def from_columns(columns: Floats, policy_use: Integers | None = None, stamps: In
     transforms._known_columns = locked(columns)
     transforms._known_policy_use = None if policy_use is None else locked(policy_use)
     transforms._known_stamps = None if stamps is None else locked(stamps)
-    return transforms
-
-
-def from_memory(memory: bytes) -> TransformArray:
-    """The transforms of seven valid columns of floats, all in one piece, and behind them their stamps in ns."""
-    transforms = _new(TransformArray)
-    transforms._memory = memory
     return transforms
 
 
