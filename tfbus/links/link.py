@@ -1,9 +1,9 @@
-"""The half that all links share: it joins a bus to a carrier for as long as its ``async with`` lasts."""
+"""The half that all links share: it joins a bus to a network for as long as its ``async with`` lasts."""
 
 import logging
+import math
 import os
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from time import monotonic
 from types import TracebackType
 from typing import Any, Self
@@ -17,18 +17,22 @@ from tfbus._aio.task_groups import close_task_group
 from tfbus._aio.turn_budget import TurnBudget
 from tfbus.bus.bus import Bus
 from tfbus.bus.queues import check_capacity
-from tfbus.bus.subscribers import OnceLogger
 from tfbus.clock import SimulatedClock
 from tfbus.errors import BusClosedError
-from tfbus.links._carrier import Carrier, SendReport, SplittingCarrier
-from tfbus.links._clock_follower import ClockFollower, HearsTime
-from tfbus.links._endpoint import Endpoint
-from tfbus.links._history import LONGEST_HISTORY
-from tfbus.links._receive_queue import Received, ReceiveQueue
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links.carrier import Received, ReceiveQueue
+from tfbus.links.clock_follower import ClockFollower, HearsTime
+from tfbus.links.domain import DomainEnd
+from tfbus.links.endpoint import Endpoint
+from tfbus.links.history import LONGEST_HISTORY
+from tfbus.links.lookups import Answers, RemoteLookups
+from tfbus.links.remote_lookup import RemoteQuestion
+from tfbus.links.wire import Wire
 from tfbus.registration import Registration
-from tfbus.stamps import as_duration
+from tfbus.stamps import LATEST, Latest, as_duration, as_stamp
 from tfbus.statistics import LinkStatistics
 from tfbus.tf_message import MalformedMessageError
+from tfbus.tree.lookup import Hold, policy_of
 
 _FULL_TURN = 5_000
 """So many samples and removals are sent at once, before the turn of the event loop ends."""
@@ -51,25 +55,14 @@ class Link:
     """Joins a bus to other buses, or to another world: ``async with link``.
 
     What is published in one turn of the event loop goes out together at its end. What comes in waits in a bounded queue
-    and is published on the event loop, 1 ms a turn. A carrier may split a large message, so that it takes several.
+    and is published on the event loop, 1 ms a turn. A large message takes several.
 
     Parameters
     ----------
-    bus : Bus
-    name : str
-        How events and log lines call the link.
-    carrier : Carrier
-        Connects to the network, and writes and reads its messages.
-    frames : iterable of str, optional
-        Send and take only these children; by default all.
-    drop_lost : bool
-        Whether the frames of a peer leave the bus when it is lost, those that it was the last to publish.
-    max_frames : int
-        How many frames one peer may have; samples of others are refused and counted.
+    end : Endpoint
+        The end of the link on its bus.
     capacity : int
         How many live messages may wait for the event loop; beyond that the oldest are dropped and counted.
-    history : float, optional
-        Ask each new peer once for the last so many seconds of its moving frames, if the carrier can.
     clock : SimulatedClock, optional
         Follows the time that a peer tells: it advances, and jumps where that time jumps. The first peer that tells a
         time is followed until it is lost; the time of others is refused and counted.
@@ -89,67 +82,42 @@ class Link:
     ValueError
         If a number is out of range.
     TypeError
-        If `frames` is one name, or a number is of another type.
+        If a number is of another type.
     OSError
-        On entering, if the carrier cannot connect.
+        On entering, if there is no connection.
     BusClosedError, RuntimeError
         On entering, if the bus is closed; if it belongs to another thread, or the link was entered before.
     """
 
     def __init__(
         self,
-        bus: Bus,
-        name: str,
-        carrier: Carrier,
+        end: Endpoint,
         *,
-        frames: Iterable[str] | None = None,
-        drop_lost: bool = False,
-        max_frames: int = 10_000,
         capacity: int = 10_000,
-        history: float | None = None,
         clock: SimulatedClock | HearsTime | None = None,
         tell_clock: bool = False,
         now: Callable[[], float] = monotonic,
     ) -> None:
+        bus = end.bus
         if tell_clock and not isinstance(bus.clock, SimulatedClock):
             raise TypeError(f"to tell the time, the bus needs a SimulatedClock, not {bus.clock!r}")
-        if isinstance(frames, str):
-            raise TypeError(f"frames must be several names, not {frames!r}")
         check_capacity(capacity)
-        check_capacity(max_frames, "max_frames")
-        if history is not None and not 0 < as_duration(history, "history") <= LONGEST_HISTORY:
-            raise ValueError(f"history must be a time that passes, {LONGEST_HISTORY:g} s at most, got {history}")
+        check_capacity(end.max_frames, "max_frames")
         self.bus = bus
-        self.id = carrier.id
-        self._name = name
-        self._carrier = carrier
-        self._log = OnceLogger(logging.getLogger("tfbus"))
-        follower = ClockFollower(clock) if isinstance(clock, SimulatedClock) else clock
-        self._follower = follower if isinstance(follower, ClockFollower) else None
-        self._endpoint = Endpoint(
-            bus,
-            name,
-            carrier,
-            self._schedule_send,
-            frames=None if frames is None else frozenset(frames),
-            drop_lost=drop_lost,
-            max_frames=max_frames,
-            wake=self._stir,
-            history=history,
-            follower=follower,
-        )
+        self.id = end.id
+        self._end = end
+        end.host = self
+        end.follower = ClockFollower(clock) if isinstance(clock, SimulatedClock) else clock
         self._told_clock = bus.clock if tell_clock and isinstance(bus.clock, SimulatedClock) else None
         self._moves: Registration | None = None
         self._stirred: anyio.Event | None = None
-        self._send_report = SendReport(self._warn_not_sent)
         self._receive_queue = ReceiveQueue(capacity)
-        self._split = carrier.split if isinstance(carrier, SplittingCarrier) else None
-        # The rest of a large message, and the item that has brought it.
-        self._parts: Iterator[Any] = iter(())
+        # The item that is being handled, and the rest of its parts.
         self._whole: Received | None = None
+        self._parts: Iterator[Any] = iter(())
         self._budget = TurnBudget(now=now)
         self._received = LoopWaker(self._handle_received)
-        self._turn_ends = LoopWaker(self._endpoint.send)
+        self._turn_ends = LoopWaker(end.send)
         self._entered = False
         self._attached = False
         self._tasks: anyio.abc.TaskGroup | None = None
@@ -159,26 +127,26 @@ class Link:
     @property
     def peers(self) -> tuple[str, ...]:
         """The ids of the other ends that are there, sorted."""
-        return self._endpoint.peers.present
+        return self._end.peers.present
 
     def __repr__(self) -> str:
         count = len(self.peers)
         state = f"{count} peer{'' if count == 1 else 's'}" if self._attached else "not joined"
-        return f"<{type(self).__name__} {self._name!r}: {state}>"
+        return f"<{type(self).__name__} {self._end.name!r}: {state}>"
 
     def statistics(self) -> LinkStatistics:
         """All counters, as they are now."""
-        endpoint, report = self._endpoint, self._send_report
+        end = self._end
         return LinkStatistics(
-            peers=len(endpoint.peers.present),
-            sent_messages=report.messages,
-            sent_samples=report.samples,
-            received_messages=endpoint.inbox.messages,
-            received_samples=endpoint.inbox.samples,
-            lost=endpoint.inbox.lost,
-            duplicates=endpoint.inbox.duplicates,
-            not_sent=dict(report.not_sent),
-            rejected=dict(endpoint.peers.rejected),
+            peers=len(end.peers.present),
+            sent_messages=end.report.messages,
+            sent_samples=end.report.samples,
+            received_messages=end.messages,
+            received_samples=end.samples,
+            lost=end.lost,
+            duplicates=end.duplicates,
+            not_sent=dict(end.report.not_sent),
+            rejected=dict(end.peers.rejected),
             queue=self._receive_queue.statistics(),
         )
 
@@ -193,22 +161,22 @@ class Link:
         for waker in (self._received, self._turn_ends):
             waker.bind()
         try:
-            await self._carrier.open(self._receive, self._send_report)
-            self._endpoint.attach()
+            await self._end.open()
+            self._end.attach()
         except BaseException:
-            await self._carrier.close()
+            await self._end.close()
             raise
         self._attached = True
         self.bus._entered.add(self)
         self._jumps = self.bus.clock.on_jump(self._clock_jumped)
         self._tasks = await anyio.create_task_group().__aenter__()
-        self._tasks.start_soon(self._carrier.run)
-        self._tasks.start_soon(self._keep_agreed)
-        if self._follower is not None:
-            self._tasks.start_soon(self._follower.run)
+        self._tasks.start_soon(self._end.run)
+        self._tasks.start_soon(self._work)
+        if isinstance(self._end.follower, ClockFollower):
+            self._tasks.start_soon(self._end.follower.run)
         if self._told_clock is not None:
-            self._moves = self._told_clock.on_move(self._endpoint.tell_time)
-            self._endpoint.tell_time(self._told_clock.now())
+            self._moves = self._told_clock.on_move(self._end.tell_time)
+            self._end.tell_time(self._told_clock.now())
         # Items that came before the link was attached are still in the queue.
         self._received.wake()
         return self
@@ -222,37 +190,19 @@ class Link:
         if self._moves is not None:
             self._moves.close()
         self._attached = False
-        self._endpoint.detach()
-        self._endpoint.send()
+        self._end.detach()
+        self._end.send()
         self._tasks.cancel_scope.cancel()
         try:
             await close_task_group(self._tasks)
         finally:
             self.bus._entered.discard(self)
-            await self._carrier.close()
+            await self._end.close()
 
-    async def _keep_agreed(self) -> None:
-        """Ask peers for what was missed, and claim the own state now and then."""
-        while True:
-            due = self._endpoint.reconcile()
-            self._stirred = anyio.Event()
-            with anyio.move_on_after(due - monotonic()):
-                await self._stirred.wait()
+    # What an end needs of the event loop
 
-    def _stir(self) -> None:
-        if self._stirred is not None:
-            self._stirred.set()
-
-    def _schedule_send(self) -> None:
-        if self._endpoint.outbox.pending >= _FULL_TURN:
-            self._endpoint.send()
-        else:
-            self._turn_ends.wake()
-
-    def _warn_not_sent(self, error: Exception) -> None:
-        self._log.warning(str(error), "not sent over the link %s: %s", self._name, error)
-
-    def _receive(self, item: Received) -> None:
+    def receive(self, item: Received) -> None:
+        """Have an item handled on the event loop; for any thread. Called by the end and its network."""
         self._receive_queue.put(item)
         try:
             self._received.wake()
@@ -260,39 +210,218 @@ class Link:
             # The event loop has ended without the end of the link, as in a crash.
             return
 
+    def send_soon(self, pending: int) -> None:
+        """Send what has gathered at the end of this turn of the event loop. Called by the end."""
+        if pending >= _FULL_TURN:
+            self._end.send()
+        else:
+            self._turn_ends.wake()
+
+    def stir(self) -> None:
+        """Look again what is due. Called by the end."""
+        if self._stirred is not None:
+            self._stirred.set()
+
+    async def _work(self) -> None:
+        while True:
+            due = self._end.work()
+            self._stirred = anyio.Event()
+            with anyio.move_on_after(due - monotonic()):
+                await self._stirred.wait()
+
     def _handle_received(self) -> None:
         self._budget.begin()
-        while self._attached:
-            item = self._next_item()
-            if item is None:
-                return
-            # A large batch is decoded over several turns, and then handled at once.
-            if item.content is not None:
-                self._endpoint.handle(item)
+        while self._attached and self._handle_part():
             if self._budget.spent:
                 # Other tasks get their turn first.
                 self._received.wake()
                 return
 
-    def _next_item(self) -> Received | None:
-        """The next part of a large message that was begun, or else the next item of the queue."""
-        while True:
-            if self._whole is not None:
-                try:
-                    return replace(self._whole, content=next(self._parts))
-                except StopIteration:
-                    self._whole = None
-                except MalformedMessageError as error:
-                    whole, self._whole = self._whole, None
-                    return replace(whole, content=error)
+    def _handle_part(self) -> bool:
+        """Handle the next part of a large message that was begun, or else of the next item; False without any."""
+        if self._whole is None:
             item = self._receive_queue.get()
-            if item is None or self._split is None:
-                return item
-            self._parts, self._whole = self._split(item.content), item
+            if item is None:
+                return False
+            self._whole, self._parts = item, self._end.split(item)
+        whole = self._whole
+        try:
+            part = next(self._parts)
+        except StopIteration:
+            self._whole = None
+        except MalformedMessageError as error:
+            self._whole = None
+            self._end.handle(whole.sender, error)
+        else:
+            # A large batch is decoded over several turns, and then handled at once.
+            if part is not None:
+                self._end.handle(whole.sender, part)
+        return True
 
     def _clock_jumped(self, before: int, after: int) -> None:
         if after < before:
             self._receive_queue.discard_moving()
             if self._whole is not None and self._whole.moving:
                 self._whole = None
-            self._endpoint.clock_jumped_back()
+            self._end.clock_jumped_back()
+
+
+class DomainLink(Link):
+    """Joins a bus to the other buses of a domain; what all links of tfbus have in common.
+
+    Parameters
+    ----------
+    bus : Bus
+    domain : str
+        Links hear each other if they have the same one.
+    wire : Wire
+        The network.
+    robot : str, optional
+        The robot whose frames this link brings: letters, digits, ``-``, ``_`` and ``.``.
+    robots : iterable of str, or mapping of str to float, optional
+        Hear only the links of these robots; ``*`` in a name stands for any letters. What others send never leaves their
+        processes for this link, and they are no peers of it. By default, it hears all, with and without a robot. A
+        mapping gives a rate in Hz for each: of a robot with a finite rate come the static frames and the newest sample
+        of each moving one, at most so often, and no more often than its links send that, by their `slow_rate`;
+        `math.inf` is for everything, and 0 for nothing but answers to lookups.
+    slow_rate : float
+        How often this link sends the newest sample of each moving frame to those that asked for less than all, in Hz.
+    frames : iterable of str, optional
+        Send and take only these children; by default all. Peers send this link no others, while the names take less
+        than 64 kB and a peer has at most a hundred different filters to serve.
+    drop_lost : bool
+        Whether the frames of a bus leave this one while no way leads to it any more, because its process has ended or
+        was cut off. Otherwise they stay until somebody removes them, here and at whoever joins later.
+    max_frames : int
+        How many frames one bus may have; samples of others are refused and counted.
+    capacity : int
+        How many live messages may wait for the event loop; then the oldest are dropped and counted.
+    history : float, optional
+        Ask each peer once, when it is met, for the last so many seconds of its moving frames, as far as buffers on its
+        bus hold them: 2,000 samples of each frame at most. They are published before what it sends live, so lookups at
+        stamps before the joining can be answered.
+    clock : SimulatedClock, optional
+        Follows the time that a peer tells: it advances, and jumps where that time jumps. The first peer that tells a
+        time is followed until it is lost; the time of others is refused and counted.
+    tell_clock : bool
+        Whether to tell peers the time of the bus's clock, which is a `SimulatedClock`.
+
+    Attributes
+    ----------
+    bus : Bus
+    domain : str
+    robot : str or None
+    id : str
+        The name of this end for its peers.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        domain: str,
+        wire: Wire,
+        *,
+        robot: str | None = None,
+        robots: Iterable[str] | Mapping[str, float] | None = None,
+        slow_rate: float = 1.0,
+        frames: Iterable[str] | None = None,
+        drop_lost: bool = False,
+        max_frames: int = 10_000,
+        capacity: int = 10_000,
+        history: float | None = None,
+        clock: SimulatedClock | HearsTime | None = None,
+        tell_clock: bool = False,
+    ) -> None:
+        if isinstance(robots, str):
+            raise TypeError(f"robots must be several names, not {robots!r}")
+        rates = robots if isinstance(robots, Mapping) else dict.fromkeys(("*",) if robots is None else robots, math.inf)
+        # Not a number is not greater either.
+        if not slow_rate > 0 or any(not rate >= 0 for rate in rates.values()):
+            raise ValueError(f"a rate must be greater than zero, got {rates!r} and {slow_rate!r} Hz")
+        if slow_rate == math.inf:
+            raise ValueError("slow_rate must be finite")
+        if history is not None and not 0 < as_duration(history, "history") <= LONGEST_HISTORY:
+            raise ValueError(f"history must be a time that passes, {LONGEST_HISTORY:g} s at most, got {history}")
+        self.domain = domain
+        self.robot = robot
+        self._domain_end = DomainEnd(
+            bus,
+            domain,
+            wire,
+            frames=frames,
+            drop_lost=drop_lost,
+            max_frames=max_frames,
+            robot=robot or "",
+            robots=dict(rates),
+            slow_rate=slow_rate,
+            history=history,
+        )
+        super().__init__(self._domain_end, capacity=capacity, clock=clock, tell_clock=tell_clock)
+
+    @property
+    def lookups(self) -> RemoteLookups:
+        """The lookups of the link; raises `RuntimeError` unless it is entered. For a `BufferServer`."""
+        if not self._attached:
+            raise RuntimeError("the link is not entered")
+        return self._domain_end.lookups
+
+    def serve(self, server: Answers | None) -> None:
+        """Say to all peers whether this link serves a buffer. Called by a `BufferServer`."""
+        self._domain_end.serve(server)
+
+    async def lookup(
+        self,
+        target: str,
+        source: str,
+        at: int | Latest = LATEST,
+        *,
+        robot: str | None = None,
+        timeout: float | None = None,
+        max_age: float | None = None,
+        source_at: int | Latest | None = None,
+        fixed: str | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> TransformStamped:
+        """The transform from `source` to `target` in the buffer of another process, as soon as it is known there.
+
+        Parameters
+        ----------
+        target, source, at, max_age, source_at, fixed, tolerance, max_gap, extrapolate
+            As those of `tfbus.Buffer.lookup`.
+        robot : str, optional
+            The robot whose buffer is asked; by default, that of a link without a robot. A `BufferServer` offers it.
+        timeout : float, optional
+            In s on the clock of the other bus, and on this machine's; None waits for as long as there is a server.
+
+        Returns
+        -------
+        TransformStamped
+
+        Raises
+        ------
+        RemoteLookupError
+            If there is no server for 3 s, or within the timeout if that is shorter; if it goes, is too busy, or does
+            not answer.
+        TransformLookupError, BusClosedError, ClockResetError, TypeError, ValueError
+            As `tfbus.Buffer.lookup` there: the same error, with its facts.
+        RuntimeError
+            If 10,000 lookups wait already, or the link is not entered.
+        """
+        policy_of(tolerance, max_gap, extrapolate)
+        limit = math.inf if timeout is None else as_duration(timeout, "timeout")
+        question = RemoteQuestion(
+            asker=self.id,
+            number=0,
+            target=target,
+            source=source,
+            at=at if isinstance(at, Latest) else as_stamp(at),
+            max_age=None if max_age is None else as_duration(max_age, "max_age"),
+            source_at=source_at if source_at is None or isinstance(source_at, Latest) else as_stamp(source_at),
+            fixed=fixed,
+            tolerance=float(tolerance),
+            max_gap=None if max_gap is None else float(max_gap),
+            hold=None if extrapolate is None else float(extrapolate.max_age),
+        )
+        return await self.lookups.ask(question, robot, limit)

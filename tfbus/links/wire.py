@@ -87,16 +87,14 @@ class Wire(Protocol):
     async def run(self) -> None:
         """Do what takes time, such as connecting to others, until cancelled."""
 
-    def publish(self, channel: str, message: bytes) -> bool:
+    def is_heard(self, channel: str) -> bool:
+        """Whether any link may hear a channel of this one; it does not block and does not raise."""
+
+    def publish(self, channel: str, message: bytes) -> None:
         """Send a message to all links that hear a channel of this one; it does not block and does not raise.
 
         While the network, or one of the links, has no room, the message is dropped for those; the links find that out
         by the numbers of messages.
-
-        Returns
-        -------
-        bool
-            Whether any link may hear the channel.
         """
 
     def send(self, link: str, message: bytes) -> bool:

@@ -8,14 +8,14 @@ was both told and sent live is news only once.
 from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from math import inf
 
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links._entries import OutgoingBatch
-from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
-from tfbus.links._outbox import Outbox
-from tfbus.links._relay import Relay
-from tfbus.links._state import StateStep
+from tfbus.links.message import Heard
+from tfbus.links.outbox import OutgoingBatch
+from tfbus.links.relay import ReceivedBatch, Relay
+from tfbus.links.replica import Replica
 from tfbus.stamps import from_seconds
 from tfbus.tree.history import FrameHistory
 
@@ -41,21 +41,18 @@ class HistoryTeller:
     bus : Bus
     relay : Relay
         That of the bus.
-    outbox : Outbox
-        That of the link.
+    replica : Replica
+        The link's copy of what it brings.
     """
 
-    def __init__(self, bus: Bus, relay: Relay, outbox: Outbox) -> None:
+    def __init__(self, bus: Bus, relay: Relay, replica: Replica) -> None:
         self._bus = bus
         self._relay = relay
-        self._state = outbox.state
-        self._sorted: tuple[int, list[str]] = (-1, [])
+        self._replica = replica
 
-    def chunk(self, seconds: float, after: str) -> tuple[list[OutgoingBatch], StateStep]:
-        """The samples of the frames whose names come after `after`; the step is final if those are all frames."""
-        if self._sorted[0] != self._state.number:
-            self._sorted = self._state.number, sorted(self._state.moving())
-        frames = self._sorted[1]
+    def chunk(self, seconds: float, after: str) -> tuple[list[OutgoingBatch], bool]:
+        """The samples of the frames whose names come after `after`, and whether those are all frames."""
+        frames = self._replica.moving()
         told: list[OutgoingBatch] = []
         count = 0
         for place in range(bisect_right(frames, after), len(frames)):
@@ -64,10 +61,10 @@ class HistoryTeller:
             if number is None or not samples:
                 continue
             if told and count + len(samples) > CHUNK:
-                return told, StateStep(0, 0, 0, final=False)
-            told.append(OutgoingBatch(*number, samples))
+                return told, False
+            told.append(OutgoingBatch(number[1], number[0], samples))
             count += len(samples)
-        return told, StateStep(0, 0, 0)
+        return told, True
 
     def _recent(self, frame: str, seconds: float) -> list[TransformStamped]:
         """The newest samples of a frame, of the buffer that holds the longest history of it."""
@@ -102,7 +99,7 @@ def _oldest(history: FrameHistory) -> int:
 class _Open:
     due: float
     after: str = ""
-    held: list[ReceivedMessage] = field(default_factory=list)
+    held: list[Heard] = field(default_factory=list)
 
 
 class HistoryAsker:
@@ -133,7 +130,7 @@ class HistoryAsker:
             self._open[peer] = _Open(self._now() + PATIENCE)
             self._ask(peer, self._seconds, "")
 
-    def holds(self, peer: str, message: ReceivedMessage) -> bool:
+    def holds(self, peer: str, message: Heard) -> bool:
         """Hold a live message back; returns whether that is so."""
         waiting = self._open.get(peer)
         if waiting is None or len(waiting.held) >= MOST_HELD:
@@ -141,10 +138,10 @@ class HistoryAsker:
         waiting.held.append(message)
         return True
 
-    def goes_on(self, peer: str, message: ReceivedMessage | None) -> bool:
+    def goes_on(self, peer: str, message: Heard) -> bool:
         """Take an answer, and ask for more if there is more; returns whether there is."""
         waiting = self._open.get(peer)
-        if waiting is None or message is None or message.step is None or message.step.final:
+        if waiting is None or message.claim.final:
             return False
         last = max(_children(message), default="")
         if last <= waiting.after or len(waiting.held) >= MOST_HELD:
@@ -154,11 +151,16 @@ class HistoryAsker:
         self._ask(peer, self._seconds, last)
         return True
 
+    @property
+    def waits(self) -> bool:
+        """Whether an answer of any peer is awaited."""
+        return bool(self._open)
+
     def is_open(self, peer: str) -> bool:
         """Whether an answer of a peer is awaited."""
         return peer in self._open
 
-    def end(self, peer: str) -> list[ReceivedMessage]:
+    def end(self, peer: str) -> list[Heard]:
         """Await no answer of a peer any more; returns what was held back."""
         waiting = self._open.pop(peer, None)
         return [] if waiting is None else waiting.held
@@ -168,12 +170,12 @@ class HistoryAsker:
         now = self._now()
         return [peer for peer, waiting in self._open.items() if waiting.due <= now]
 
-    def next_due(self) -> float | None:
-        """The time at which `overdue` is to be called next; None while no answer is awaited."""
-        return min((waiting.due for waiting in self._open.values()), default=None)
+    def next_due(self) -> float:
+        """The time at which `overdue` is to be called next."""
+        return min((waiting.due for waiting in self._open.values()), default=inf)
 
 
-def _children(message: ReceivedMessage) -> Iterable[str]:
+def _children(message: Heard) -> Iterable[str]:
     for entry in message.entries:
         if isinstance(entry, ReceivedBatch):
             for sample in entry.samples:

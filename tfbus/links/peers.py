@@ -1,22 +1,13 @@
 """The peers of a link: who is present, how much each may send, and what was refused of it."""
 
 from collections import Counter
-from collections.abc import Callable
-from itertools import count
+from collections.abc import Callable, Collection, Iterator
 
 from tfbus.bus.subscribers import SeenKeys
-from tfbus.links._mirror import Mirror
 
 MAX_PEERS = 1_000
 MAX_AUTHORITIES = 1_000
 _REMEMBERED_REASONS = 100
-
-_ages = count()
-
-
-def next_age() -> int:
-    """A number higher than all before it: it tells which of two meetings and losses of peers was later."""
-    return next(_ages)
 
 
 class Peer:
@@ -25,32 +16,32 @@ class Peer:
     Attributes
     ----------
     id : str
-    age : int
-        From `next_age`, when it was met; a peer that was lost and comes back is met anew.
     present : bool
         Whether it has announced that it is there.
+    robot : str
+        The robot whose link it is; empty without one.
     number : int
-        The number of its newest live message.
+        That of its newest live message; 0 before the first.
     authorities : set of str
         The authorities whose samples it has sent.
-    frames : set of (bytes, str)
-        Origin and child of all frames that it was the first to bring; their number is limited.
-    mirror : Mirror or None
-        What it has told of its state, once it is present, if the carrier can ask it.
+    frames : set of str
+        The frames that it was the first to bring from a world without origins; their number is limited.
+    paths : dict of bytes to tuple of bytes
+        The buses that are reached through it, its own among them, each with the buses on the way there.
     reported : SeenKeys
         The reasons of refusals that were reported.
     """
 
-    __slots__ = ("age", "authorities", "frames", "id", "mirror", "number", "present", "reported")
+    __slots__ = ("authorities", "frames", "id", "number", "paths", "present", "reported", "robot")
 
     def __init__(self, id: str) -> None:  # noqa: A002 - the wire calls it so
         self.id = id
-        self.age = next_age()
         self.present = False
+        self.robot = ""
         self.number = 0
         self.authorities: set[str] = set()
-        self.frames: set[tuple[bytes, str]] = set()
-        self.mirror: Mirror | None = None
+        self.frames: set[str] = set()
+        self.paths: dict[bytes, tuple[bytes, ...]] = {}
         self.reported = SeenKeys(_REMEMBERED_REASONS)
 
 
@@ -73,6 +64,9 @@ class Peers:
         self._peers: dict[str, Peer] = {}
         self._reported_of_unknown = SeenKeys(_REMEMBERED_REASONS)
         self.rejected: Counter[str] = Counter()
+
+    def __iter__(self) -> Iterator[Peer]:
+        return iter(self._peers.values())
 
     def __len__(self) -> int:
         """The number of peers that are known, present or not."""
@@ -97,24 +91,26 @@ class Peers:
         """The peer of an id, if it is known."""
         return self._peers.get(id)
 
-    def brings(self, frame: str, besides: Peer | None) -> bool:
-        """Whether any peer but one has told that it brings a frame."""
-        return any(
-            peer.mirror is not None and peer is not besides and frame in peer.mirror for peer in self._peers.values()
-        )
-
-    def make_room(self, id: str) -> Peer | None:  # noqa: A002
-        """Evict a peer that has not announced itself, if all places are taken, for a new one that has.
+    def join(self, id: str) -> tuple[Peer | None, Peer | None]:  # noqa: A002
+        """Note that a peer is there.
 
         Returns
         -------
-        Peer or None
-            The evicted one.
+        peer : Peer or None
+            None if it was present before, or there is no place.
+        evicted : Peer or None
+            A peer that has never announced itself, and had to make room.
         """
-        if id in self._peers or len(self._peers) < MAX_PEERS:
-            return None
-        unannounced = next((peer for peer in self._peers.values() if not peer.present), None)
-        return None if unannounced is None else self._peers.pop(unannounced.id)
+        evicted = None
+        if id not in self._peers and len(self._peers) >= MAX_PEERS:
+            evicted = next((peer for peer in self._peers.values() if not peer.present), None)
+            if evicted is not None:
+                del self._peers[evicted.id]
+        peer = self.find(id)
+        if peer is None or peer.present:
+            return None, evicted
+        peer.present = True
+        return peer, evicted
 
     def forget(self, id: str) -> Peer | None:  # noqa: A002
         """Remove a peer that has gone; returns it if it was known."""
@@ -133,3 +129,14 @@ class Peers:
         reported = self._reported_of_unknown if peer is None else peer.reported
         if reported.add(reason):
             self._report(id, reason, error)
+
+    def admit_authorities(self, peer: Peer, authorities: Collection[str], samples: int) -> bool:
+        """Note the authorities that a batch names; returns False, and refuses the batch, if they are too many."""
+        for authority in authorities:
+            if authority not in peer.authorities:
+                if len(peer.authorities) >= MAX_AUTHORITIES:
+                    error = ValueError(f"the peer has spoken for more than {MAX_AUTHORITIES} authorities")
+                    self.reject(peer.id, "too many authorities", error, samples)
+                    return False
+                peer.authorities.add(authority)
+        return True

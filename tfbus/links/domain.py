@@ -1,0 +1,603 @@
+"""The end of a link of tfbus, between the relay of its bus and a wire; `tfbus.links.replica` tells the protocol."""
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import nullcontext
+from fnmatch import fnmatchcase
+from math import inf
+from time import monotonic
+from typing import Any
+
+from tfbus.bus.bus import Bus
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links.carrier import Presence, Received
+from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
+from tfbus.links.endpoint import Endpoint
+from tfbus.links.history import HistoryAsker, HistoryTeller
+from tfbus.links.lookups import Answers, RemoteLookups
+from tfbus.links.message import (
+    LONGEST_WAY,
+    Heard,
+    Kind,
+    Outgoing,
+    Text,
+    Way,
+    can_hold,
+    kind_of,
+    read_fields,
+    read_message,
+    write_message,
+    write_text,
+)
+from tfbus.links.outbox import Outbox, OutgoingBatch, RemovedFrame, Turn
+from tfbus.links.peers import Peer
+from tfbus.links.relay import Provenance, ReceivedBatch, ReceivedTransform
+from tfbus.links.replica import CHUNK, Agreement, Claim, Replica, TooManyEntriesError
+from tfbus.links.wire import Hearing, Joined, Left, Wire, WireItem
+from tfbus.tf_message import MalformedMessageError
+
+SIGN_PERIOD = 1.0
+SIGN_PERIOD_EACH = 0.05
+LONGEST_SIGN_PERIOD = 2.0
+LONGEST_SIGN_PERIOD_EACH = 0.1
+"""s; a link signs so long after it has sent something or met a peer, and then after twice that time, up to the longest.
+
+A sign goes to all peers, so a link with many of them signs less often: both times are at least so much for each peer.
+"""
+_LARGEST_GAP = 2**32
+_URGENT = frozenset(Kind) - {Kind.LIVE, Kind.SIGN}
+_FOLLOWS = frozenset({Kind.MEETING, Kind.ANSWER, Kind.PAST})
+
+
+class DomainOutbox(Outbox):
+    """The outbox of a link of tfbus; what goes out is noted in the link's copy of the domain.
+
+    Parameters
+    ----------
+    end : DomainEnd
+    """
+
+    keeps_withdrawn = True
+
+    def __init__(self, end: "DomainEnd") -> None:
+        super().__init__(end.frames, end._notify)
+        self._end = end
+
+    def own_sample(self, frame: str) -> TransformStamped | None:
+        entry = self._end.own.entries.get(frame)
+        return None if entry is None or entry.origin != self._end.relay.origin else entry.sample
+
+    def ways(self) -> Iterator[Way]:
+        return self._end.ways()
+
+    def reach_changed(self) -> None:
+        self._end.sign_soon()
+
+    def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
+        if not echo:
+            own, rank = self._end.own, (batch.sequence, batch.origin)
+            for sample in batch.samples:
+                if can_hold(sample):
+                    _, child, _, _, _, static = sample._fields
+                    try:
+                        own.note(child, rank, sample, ours=True, settles=not static)
+                    except TooManyEntriesError:
+                        continue
+        return False
+
+    def _follow_removal(self, removal: RemovedFrame, echo: bool, withdrawn: bool) -> bool:
+        if not echo and not withdrawn:
+            self._end.own.note(removal.frame, (removal.sequence, removal.origin), None, ours=True)
+        return False
+
+
+class DomainEnd(Endpoint):
+    """The end of a link of tfbus.
+
+    Parameters
+    ----------
+    bus, name, frames, drop_lost, max_frames
+        As for `Endpoint`.
+    wire : Wire
+    robot : str
+        The robot whose frames this bus brings; empty without one.
+    robots : dict of str to float
+        Patterns of the robots that are heard, each with a rate in Hz; infinite for everything, 0 for nothing but who is
+        there.
+    slow_rate : float
+        How often the newest samples go to those that hear less than all, in Hz.
+    history : float or None
+        How many seconds of the past each new peer is asked for.
+
+    Attributes
+    ----------
+    own : Replica
+        The copy of what the links of this robot bring.
+    lookups : RemoteLookups
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        name: str,
+        wire: Wire,
+        *,
+        frames: Iterable[str] | None = None,
+        drop_lost: bool = False,
+        max_frames: int = 10_000,
+        robot: str = "",
+        robots: dict[str, float] | None = None,
+        slow_rate: float = 1.0,
+        history: float | None = None,
+    ) -> None:
+        super().__init__(bus, name, frames, drop_lost, max_frames)
+        self.id = wire.id
+        self._wire = wire
+        self._robot = robot
+        self._robots = {"*": inf} if robots is None else robots
+        self._slow_period = 1 / slow_rate
+        self._channel = ALL if self.frames is None else filter_name(self.frames)
+        # Whether peers are to send the wanted frames only.
+        self._filters = self._channel != ALL
+        self.outbox = DomainOutbox(self)
+        self._channels = Channels(wire, self.relay.origin, self.frames is not None)
+        self._channels.report = self.report
+        self._replicas: dict[str, Replica] = {}
+        self.own = self._replica_of(robot)
+        self._agreement = Agreement()
+        self._history_teller = HistoryTeller(bus, self.relay, self.own)
+        self._history = None if history is None else HistoryAsker(history, self._ask_past, monotonic)
+        self.lookups = RemoteLookups(wire.send, wire.id, name)
+        self._news: dict[str, bool] = {}
+        self._thinned: dict[str, float] = {}
+        self._signed_at = -inf
+        self._sign_period = SIGN_PERIOD
+        self._slow_due = -inf
+
+    # For the link
+
+    async def open(self) -> None:
+        await self._wire.open(self._hearings(), self._receive, self.report.failed)
+
+    async def run(self) -> None:
+        await self._wire.run()
+
+    async def close(self) -> None:
+        await self._wire.close()
+
+    def attach(self) -> None:
+        self.relay.attach(self.outbox)
+        self.lookups.open()
+
+    def detach(self) -> None:
+        self.lookups.close()
+        for peer in self.peers.forget_all():
+            self._forget(peer)
+        self.relay.detach(self.outbox)
+
+    def work(self) -> float:
+        now = monotonic()
+        question = self._agreement.question(now)
+        if question is not None:
+            frames = sorted(self.frames) if self.frames is not None and self._filters else None
+            if not self._wire.send(question.peer, write_text(Kind.QUESTION, {"since": question.since, "frames": frames})):
+                self._agreement.unanswered(question.peer, now)
+        if now >= self._signed_at + self._sign_period:
+            peers = len(self.peers.present)
+            self._sign_period = min(
+                2 * self._sign_period, max(LONGEST_SIGN_PERIOD, LONGEST_SIGN_PERIOD_EACH * peers)
+            )
+            self._sign(now)
+        if self._history is not None:
+            for peer in self._history.overdue():
+                self._end_history(peer)
+        due = min(self._agreement.next_due(), self._signed_at + self._sign_period)
+        if self._history is not None:
+            due = min(due, self._history.next_due())
+        if self._wire.is_heard(SLOW):
+            if now >= self._slow_due:
+                self._slow_due = now + self._slow_period
+                self._channels.send_slowly()
+            due = min(due, self._slow_due)
+        return due
+
+    def split(self, item: Received) -> Iterator[Any]:
+        return read_message(item.content) if isinstance(item.content, bytes) else iter((item.content,))
+
+    # For its parts
+
+    def sign_soon(self) -> None:
+        """Sign in this turn of the event loop, or the next."""
+        self._signed_at = -inf
+        self.host.stir()
+
+    def serve(self, server: Answers | None) -> None:
+        """Serve a buffer, or none any more."""
+        self.lookups.server = server
+        self.sign_soon()
+
+    def ways(self) -> Iterator[Way]:
+        """The buses that the peers lead to, each with the buses on the way there."""
+        for peer in self.peers:
+            yield from peer.paths.items()
+
+    # Going out
+
+    def _send(self, turn: Turn) -> None:
+        self._channels.send(turn, monotonic())
+        self._sign_sooner()
+
+    def _sign_sooner(self) -> None:
+        period = max(SIGN_PERIOD, SIGN_PERIOD_EACH * len(self.peers))
+        if period < self._sign_period:
+            self._sign_period = period
+            self.host.stir()
+
+    def _sign(self, now: float) -> None:
+        self._signed_at = now
+        self.send()
+        self._channels.sign(self.own, now, self._reach(), self._serves)
+
+    def _reach(self) -> list[Way]:
+        besides = self.relay.reach_besides(self.outbox)
+        return [(origin, path) for origin, path in besides.items() if len(path) < LONGEST_WAY][:255]
+
+    def _meet(self, peer: Peer) -> None:
+        """Tell a new peer what this link brings, or that it is much."""
+        self.send()
+        claim = self.own.claim(monotonic())._replace(partial=self.frames is not None)
+        out = Outgoing(Kind.MEETING, self.relay.origin, 0, claim, self.outbox.time, self._reach(), self._serves)
+        entries: Sequence[OutgoingBatch | RemovedFrame] = self.own.ours(CHUNK) or ()
+        try:
+            message = write_message(out, entries)
+        except ValueError:
+            message = write_message(out)
+        self._wire.send(peer.id, message)
+
+    # Coming in
+
+    def _receive(self, link: str, item: WireItem) -> None:
+        """Take an item of the wire, from any thread."""
+        if isinstance(item, bytes):
+            kind = kind_of(item)
+            urgent = kind in _URGENT
+            received = Received(link, item, len(item), kind is Kind.LIVE, urgent, kind in _FOLLOWS)
+        elif isinstance(item, Left):
+            received = Received(link, Presence.LEFT, urgent=True)
+        else:
+            received = Received(link, item, urgent=isinstance(item, Joined))
+        self.host.receive(received)
+
+    def _take(self, sender: str, content: Any) -> None:
+        if isinstance(content, Joined):
+            peer = self._join(sender, content.robot)
+            if peer is not None:
+                # A peer hears of a filter by the first question.
+                self._agreement.joined(sender, self._replica_of(peer.robot), monotonic(), must_ask=self._filters)
+                self._meet(peer)
+                self._sign_sooner()
+                if self._history is not None:
+                    self._history.joined(sender)
+                self.host.stir()
+        elif isinstance(content, Text):
+            self._take_text(sender, content)
+        else:
+            self._take_message(sender, content)
+
+    def _take_text(self, sender: str, text: Text) -> None:
+        if text.kind is Kind.LOOKUP:
+            self.lookups.asked(sender, text.data)
+        elif text.kind is Kind.LOOKUP_ANSWER:
+            self.lookups.answered(sender, text.data)
+        else:
+            fields = read_fields(text.data)
+            # What is told must not overtake a batch that has gathered.
+            self.send()
+            if text.kind is Kind.QUESTION:
+                self._answer(sender, fields)
+            else:
+                self._tell_past(sender, fields)
+
+    def _take_message(self, sender: str, heard: Heard) -> None:
+        peer = self.peers.get(sender)
+        if peer is None or not peer.present or self.bus.closed:
+            return
+        if heard.kind is Kind.LIVE and self._is_thinned(peer, heard):
+            return
+        if heard.time is not None:
+            self._hear_time(sender, heard.time)
+        if not heard.continues:
+            self._update_ways(peer, heard)
+            if heard.kind in (Kind.SIGN, Kind.MEETING):
+                self.lookups.note_server(sender, peer.robot, heard.serves)
+            if heard.kind is not Kind.SIGN:
+                self.messages += 1
+        if heard.kind is Kind.LIVE and self._history is not None and self._history.holds(sender, heard):
+            return
+        self._take_held(peer, heard)
+
+    def _take_held(self, peer: Peer, heard: Heard) -> None:
+        now = monotonic()
+        live = heard.kind is Kind.LIVE
+        if not heard.continues and (live or heard.kind is Kind.SIGN) and self._count_gap(peer, heard.number, live):
+            self._agreement.missed(peer.id, now)
+        if heard.kind is Kind.PAST:
+            self._take_past(peer, heard)
+            return
+        news = self._take_entries(peer, heard, live)
+        if heard.kind is Kind.ANSWER:
+            news = self._news.pop(peer.id, False) or news
+            if heard.goes_on:
+                self._news[peer.id] = news
+            else:
+                self._agreement.answered(peer.id, heard.claim, news, now)
+        elif not heard.goes_on and not live:
+            is_much = heard.kind is Kind.MEETING and not heard.continues and not heard.entries
+            self._agreement.told(peer.id, heard.claim, now, soon=is_much)
+        if not live or heard.number:
+            self.host.stir()
+
+    def _take_entries(self, peer: Peer, heard: Heard, live: bool) -> bool:
+        """Note and publish the entries of a message; returns whether any of them was new to the copy."""
+        for error in heard.errors:
+            self.peers.reject(peer.id, error.reason, error)
+        replica = self._replica_of(peer.robot)
+        news = False
+        together: list[tuple[Provenance, list[ReceivedTransform]]] = []
+        for entry in heard.entries:
+            if isinstance(entry, ReceivedBatch):
+                assert entry.origin is not None
+                size = len(entry.samples)
+                if not self._admit_number(peer, entry.sequence, size):
+                    continue
+                if not self.peers.admit_authorities(peer, entry.authorities, size):
+                    continue
+                provenance = Provenance(entry.origin, entry.sequence, self.outbox, peer)
+                samples = self._note(replica, provenance, entry.samples, live)
+                news = news or (bool(samples) and not live)
+                together.append((provenance, samples))
+                # The batches of an answer were never one batch, but nothing is between them.
+                if not live:
+                    continue
+            self._publish(peer, together, live)
+            together.clear()
+            if self.bus.closed:
+                # A subscriber may have closed it since the last entry.
+                return news
+            if isinstance(entry, RemovedFrame):
+                news = self._take_removal(peer, replica, entry) or news
+        self._publish(peer, together, live)
+        return news
+
+    def _note(
+        self, replica: Replica, provenance: Provenance, samples: list[ReceivedTransform], live: bool
+    ) -> list[ReceivedTransform]:
+        """Note the samples of a batch; returns those that are to be published if they are news."""
+        samples = [sample for sample in samples if self._is_wanted(sample)]
+        rank, peer = provenance.rank, provenance.peer
+        if provenance.origin == self.relay.origin:
+            return samples
+        kept: list[ReceivedTransform] = []
+        for sample in samples:
+            _, child, _, _, _, static = sample._fields
+            try:
+                is_new = replica.note(child, rank, sample, settles=live and not static)
+            except TooManyEntriesError as error:
+                assert peer is not None
+                self.peers.reject(peer.id, "too many frames", error)
+                continue
+            if live or is_new:
+                kept.append(sample)
+        return kept
+
+    def _is_wanted(self, sample: ReceivedTransform) -> bool:
+        return self.frames is None or sample._fields[1] in self.frames
+
+    def _take_removal(self, peer: Peer, replica: Replica, removal: RemovedFrame) -> bool:
+        if self.frames is not None and removal.frame not in self.frames:
+            return False
+        if not self._admit_number(peer, removal.sequence, 1):
+            return False
+        provenance = Provenance(removal.origin, removal.sequence, self.outbox, peer)
+        is_own = removal.origin == self.relay.origin
+        is_new = not is_own and replica.note(removal.frame, provenance.rank, None)
+        if is_new or is_own:
+            self.relay.remove(provenance, removal.frame)
+        return is_new
+
+    def _publish(
+        self,
+        peer: Peer,
+        batches: Sequence[tuple[Provenance, Sequence[ReceivedTransform]]],
+        live: bool,
+        past: bool = False,
+    ) -> None:
+        if not live and not past and self._history is not None and self._history.waits:
+            # The newest sample of a moving frame would make its past no news.
+            batches = [(source, [sample for sample in samples if sample.static]) for source, samples in batches]
+        if self.drop_lost:
+            batches = [(source, samples) for source, samples in batches if self.relay.reaches(source.origin)]
+        offered = sum(len(samples) for _, samples in batches)
+        if not offered:
+            return
+        with nullcontext() if live else self.bus._kept_samples():
+            published, refused = self.relay.publish(batches, self.max_frames)
+        self._count(peer.id, offered, published, refused)
+
+    def _admit_number(self, peer: Peer, number: int, count: int) -> bool:
+        """Refuse a number that no bus can have given; else all later ones of its origin would be no news."""
+        if self.relay.is_plausible(number):
+            return True
+        error = ValueError(f"a batch with the number {number}, which is too far ahead of all others")
+        self.peers.reject(peer.id, "number", error, count)
+        return False
+
+    def _count_gap(self, peer: Peer, number: int, live: bool) -> bool:
+        """Count the live messages that have not come; returns whether there are any."""
+        if not number:
+            return False
+        missing = number - peer.number - live
+        # Nobody has sent so many messages: a larger gap means that one of the two numbers is made up.
+        if abs(missing) > _LARGEST_GAP:
+            peer.number = number
+            return True
+        if number <= peer.number:
+            return False
+        known = peer.number > 0
+        peer.number = number
+        if known:
+            self.lost += missing
+        return known and missing > 0
+
+    def _is_thinned(self, peer: Peer, heard: Heard) -> bool:
+        """Whether a message with newest samples comes before its time."""
+        rate = self._rate_of(peer.robot)
+        if heard.number or rate == inf:
+            return False
+        now = monotonic()
+        since = now - self._thinned.get(peer.id, -inf)
+        # Samples that belong together come in several messages at once.
+        if since > 0.02:
+            if since < 0.9 / rate:
+                return True
+            self._thinned[peer.id] = now
+        return False
+
+    # Presence
+
+    def _lose(self, peer: Peer) -> tuple[str, ...]:
+        lost = self._forget(peer)
+        frames = tuple(self.relay.frames_of(lost))
+        if self.drop_lost:
+            self.relay.withdraw(frames, lost)
+        self.relay.forget_origins(lost)
+        return frames
+
+    def _forget(self, peer: Peer) -> set[bytes]:
+        """Forget a peer; returns the buses that no way leads to any more."""
+        self._end_history(peer.id)
+        self._agreement.left(peer.id)
+        self.lookups.left(peer.id)
+        self._news.pop(peer.id, None)
+        self._thinned.pop(peer.id, None)
+        lost = {bus for bus in peer.paths if self.relay.way_closed(bus)}
+        if peer.paths:
+            self.relay.reach_changed(self.outbox)
+        return lost
+
+    def _update_ways(self, peer: Peer, heard: Heard) -> None:
+        """Note which buses a peer leads to: its own, and by a sign all that it tells."""
+        own = self.relay.origin
+        if heard.kind in (Kind.SIGN, Kind.MEETING):
+            told = {bus: (heard.bus, *path) for bus, path in heard.reach if bus != own and own not in path}
+            paths = {heard.bus: (), **{bus: path for bus, path in told.items() if bus != heard.bus}}
+        elif heard.bus in peer.paths:
+            return
+        else:
+            paths = {**peer.paths, heard.bus: ()}
+        paths.pop(own, None)
+        if paths == peer.paths:
+            return
+        before, peer.paths = peer.paths, paths
+        opened = [bus for bus in paths if bus not in before and not self.relay.reaches(bus)]
+        for bus in paths.keys() - before.keys():
+            self.relay.way_opened(bus)
+        lost = {bus for bus in before.keys() - paths.keys() if self.relay.way_closed(bus)}
+        self.relay.reach_changed(self.outbox)
+        if self.drop_lost:
+            self.relay.withdraw(self.relay.frames_of(lost), lost)
+            self._show(peer, set(opened))
+        self.relay.forget_origins(lost)
+
+    def _show(self, peer: Peer, buses: Collection[bytes]) -> None:
+        """Publish what the copies hold of buses to which a way leads again."""
+        batches: list[tuple[Provenance, list[ReceivedTransform]]] = []
+        for replica in self._replicas.values() if buses else ():
+            for entry in replica.entries.values():
+                if entry.origin in buses and isinstance(entry.sample, ReceivedTransform):
+                    batches.append((Provenance(entry.origin, entry.number, self.outbox, peer), [entry.sample]))
+        self._publish(peer, batches, live=False)
+
+    # Answers
+
+    def _answer(self, sender: str, fields: dict[str, Any]) -> None:
+        since, names = fields.get("since"), fields.get("frames")
+        frames = None
+        if type(since) is not int or not 0 <= since < 2**64:
+            raise MalformedMessageError("text", f"a question since {since!r}"[:100])
+        if names is not None:
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                raise MalformedMessageError("text", "a filter without names")
+            frames = frozenset(names)
+            if not self._channels.serve(frames, monotonic()):
+                error = ValueError("too many different filters to serve")
+                self.peers.reject(sender, "too many filters", error)
+        limit = CHUNK
+        while limit:
+            entries, claim = self.own.changes(since, monotonic(), frames, limit)
+            claim = claim._replace(partial=self.frames is not None)
+            out = Outgoing(Kind.ANSWER, self.relay.origin, 0, claim, None, self._reach())
+            try:
+                message = write_message(out, entries)
+            except ValueError:
+                limit //= 2
+            else:
+                self._wire.send(sender, message)
+                return
+
+    def _tell_past(self, sender: str, fields: dict[str, Any]) -> None:
+        seconds, after = fields.get("seconds"), fields.get("after")
+        if isinstance(seconds, bool) or not isinstance(seconds, (int, float)) or not isinstance(after, str):
+            raise MalformedMessageError("text", "a question for the past without a time and a name")
+        entries, final = self._history_teller.chunk(seconds, after)
+        out = Outgoing(Kind.PAST, self.relay.origin, 0, Claim(0, 0, 0, final))
+        self._wire.send(sender, write_message(out, entries))
+
+    def _ask_past(self, peer: str, seconds: float, after: str) -> None:
+        self._wire.send(peer, write_text(Kind.PAST_QUESTION, {"seconds": seconds, "after": after}))
+
+    def _take_past(self, peer: Peer, heard: Heard) -> None:
+        if self._history is None or not self._history.is_open(peer.id):
+            return
+        goes_on = heard.goes_on
+        try:
+            batches: list[tuple[Provenance, list[ReceivedTransform]]] = []
+            for entry in heard.entries:
+                if isinstance(entry, ReceivedBatch) and self._admit_number(peer, entry.sequence, len(entry.samples)):
+                    assert entry.origin is not None
+                    samples = [sample for sample in entry.samples if self._is_wanted(sample)]
+                    batches.append((Provenance(entry.origin, entry.sequence, self.outbox, peer), samples))
+            self._publish(peer, batches, live=False, past=True)
+            goes_on = goes_on or self._history.goes_on(peer.id, heard)
+        finally:
+            if not goes_on:
+                self._end_history(peer.id)
+
+    def _end_history(self, peer: str) -> None:
+        """Publish what waited for the past of a peer, with it or without it."""
+        known = self.peers.get(peer)
+        if self._history is not None and self._history.is_open(peer):
+            held = self._history.end(peer)
+            if known is not None:
+                # The newest samples that were told meanwhile, if no past has come.
+                self._show(known, set(known.paths))
+                for heard in held:
+                    self._take_held(known, heard)
+
+    # Robots
+
+    @property
+    def _serves(self) -> bool:
+        return self.lookups.server is not None
+
+    def _replica_of(self, robot: str) -> Replica:
+        replica = self._replicas.get(robot)
+        if replica is None:
+            replica = self._replicas[robot] = Replica(self.max_frames, self.relay.origin)
+        return replica
+
+    def _hearings(self) -> list[Hearing]:
+        channels = {inf: self._channel, 0.0: QUIET}
+        return [Hearing(robots, channels.get(rate, SLOW)) for robots, rate in self._robots.items()]
+
+    def _rate_of(self, robot: str) -> float:
+        return next((rate for robots, rate in self._robots.items() if fnmatchcase(robot, robots)), inf)

@@ -1,0 +1,299 @@
+"""One end of a link without its event loop: it publishes on the bus what peers have sent, within limits, and tells of it.
+
+`ForeignEnd` is the end of a link to another world, over a carrier; `tfbus.links.domain.DomainEnd` that of a link of
+tfbus, over a wire. Nothing that a peer sends makes either of them raise.
+"""
+
+import logging
+from collections.abc import Collection, Iterable, Iterator
+from copy import copy
+from math import inf
+from typing import Any, Protocol
+
+from tfbus.bus.bus import Bus
+from tfbus.bus.subscribers import OnceLogger
+from tfbus.events import PeerJoined, PeerLost, PeerRejected
+from tfbus.links.carrier import Carrier, Presence, Received, SendReport, SplittingCarrier
+from tfbus.links.clock_follower import HearsTime
+from tfbus.links.outbox import LatchingOutbox, Outbox, Turn
+from tfbus.links.peers import Peer, Peers
+from tfbus.links.relay import relay_of
+from tfbus.tf_message import MalformedMessageError
+
+
+class Host(Protocol):
+    """What an end needs of the event loop, and of the link that has one."""
+
+    def receive(self, item: Received) -> None:
+        """Have an item handled on the event loop; for any thread."""
+
+    def send_soon(self, pending: int) -> None:
+        """Have `Endpoint.send` called at the end of the turn of the event loop; so many samples wait."""
+
+    def stir(self) -> None:
+        """Have `Endpoint.work` called before the time that it has returned."""
+
+
+class Endpoint:
+    """The bus's end of a link.
+
+    Parameters
+    ----------
+    bus : Bus
+    name : str
+        How events and log lines call the link.
+    frames : iterable of str or None
+        The children that go out and come in; None for all.
+    drop_lost : bool
+        Whether the frames of a lost peer leave the bus.
+    max_frames : int
+        How many frames one bus, or one peer of another world, may have.
+
+    Attributes
+    ----------
+    id : str
+        The name of this end for its peers.
+    host : Host
+        Set by the link before anything is called.
+    follower : HearsTime or None
+        Hears the time of the first peer that tells one, until that peer is lost.
+    outbox : Outbox
+    peers : Peers
+    report : SendReport
+    messages, samples : int
+        How many messages were accepted, and how many samples were published.
+    lost : int
+        How many live messages never came, by their numbers.
+    duplicates : int
+        How many samples were no news.
+    """
+
+    id: str
+    host: Host
+    outbox: Outbox
+
+    def __init__(self, bus: Bus, name: str, frames: Iterable[str] | None, drop_lost: bool, max_frames: int) -> None:
+        if isinstance(frames, str):
+            raise TypeError(f"frames must be several names, not {frames!r}")
+        self.bus = bus
+        self.name = name
+        self.frames = None if frames is None else frozenset(frames)
+        self.drop_lost = drop_lost
+        self.max_frames = max_frames
+        self.follower: HearsTime | None = None
+        self._followed: str | None = None
+        self._log = OnceLogger(logging.getLogger("tfbus"))
+        self.relay = relay_of(bus)
+        self.peers = Peers(self._tell_rejection)
+        self.report = SendReport(self._warn_not_sent)
+        self.messages = 0
+        self.samples = 0
+        self.lost = 0
+        self.duplicates = 0
+
+    # For the link
+
+    async def open(self) -> None:
+        """Connect to the network; raises `OSError` if it cannot."""
+        raise NotImplementedError
+
+    async def run(self) -> None:
+        """Do what takes time, until cancelled."""
+        raise NotImplementedError
+
+    async def close(self) -> None:
+        """Disconnect."""
+        raise NotImplementedError
+
+    def attach(self) -> None:
+        """Join the bus: from now on, all that is latched or published gathers in the outbox.
+
+        Raises
+        ------
+        BusClosedError
+        """
+        self.relay.attach(self.outbox, foreign=True)
+
+    def detach(self) -> None:
+        """Leave the bus; its peers are forgotten, and their frames stay."""
+        self.peers.forget_all()
+        self.relay.detach(self.outbox)
+
+    def clock_jumped_back(self) -> None:
+        """Take samples with the stamps of earlier ones for news."""
+        self.relay.clock_jumped_back()
+
+    def tell_time(self, stamp: int) -> None:
+        """Tell peers the time of this bus's clock, in ns, with all that is published from now on."""
+        if self.outbox.time is not None and stamp < self.outbox.time:
+            # Samples that were published before the jump are of the time before it.
+            self.send()
+        self.outbox.tell_time(stamp)
+
+    def send(self) -> None:
+        """Hand to the network all that has gathered in the outbox, if there is anything."""
+        turn = self.outbox.flush()
+        if turn.entries or turn.statics or turn.time is not None:
+            self._send(turn)
+
+    def work(self) -> float:
+        """Do what is due; returns the time of the next call, in s of the monotonic clock."""
+        return inf
+
+    def split(self, item: Received) -> Iterator[Any]:
+        """The content of an item in parts, None where other tasks may have their turn.
+
+        Raises
+        ------
+        MalformedMessageError
+            If the rest of the item cannot be used.
+        """
+        return iter((item.content,))
+
+    def handle(self, sender: str, content: Any) -> None:
+        """Handle a part of an item; nothing in it makes this raise."""
+        try:
+            if content is Presence.JOINED:
+                self._join(sender)
+            elif content is Presence.LEFT:
+                self._leave(sender)
+            elif isinstance(content, MalformedMessageError):
+                self.peers.reject(sender, content.reason, content)
+            else:
+                self._take(sender, content)
+        except MalformedMessageError as error:
+            self.peers.reject(sender, error.reason, error)
+        except Exception as error:  # noqa: BLE001 - no peer, and no subscriber, may end the event loop
+            self.peers.reject(sender, "not published", error)
+
+    # For the two kinds of ends
+
+    def _send(self, turn: Turn) -> None:
+        raise NotImplementedError
+
+    def _take(self, sender: str, content: Any) -> None:
+        """Handle a message."""
+        raise NotImplementedError
+
+    def _lose(self, peer: Peer) -> tuple[str, ...]:
+        """Forget what a lost peer has brought; returns its frames, sorted."""
+        raise NotImplementedError
+
+    def _join(self, sender: str, robot: str = "") -> Peer | None:
+        """Note that a peer is there; returns it if that is new."""
+        peer, evicted = self.peers.join(sender)
+        if evicted is not None:
+            self._lose(evicted)
+        if peer is not None:
+            peer.robot = robot
+            if self.outbox.time is not None:
+                self.outbox.tell_time(self.outbox.time)
+            self.bus._announce(PeerJoined(self.bus.clock.now(), self.name, sender))
+        return peer
+
+    def _leave(self, sender: str) -> None:
+        if sender == self._followed:
+            self._followed = None
+        peer = self.peers.forget(sender)
+        if peer is not None:
+            frames = self._lose(peer)
+            authorities = tuple(sorted(peer.authorities))
+            self.bus._announce(PeerLost(self.bus.clock.now(), self.name, sender, authorities, frames))
+
+    def _hear_time(self, sender: str, stamp: int) -> None:
+        if self.follower is None or self.peers.find(sender) is None:
+            return
+        if self._followed is None:
+            self._followed = sender
+        if sender == self._followed:
+            self.follower.hear(stamp)
+        else:
+            error = ValueError(f"this bus follows the clock of peer {self._followed}")
+            self.peers.reject(sender, "second clock", error)
+
+    def _count(self, sender: str, offered: int, published: int, refused: int) -> None:
+        self.samples += published
+        self.duplicates += offered - published - refused
+        if refused:
+            error = ValueError(f"the peer has announced more than {self.max_frames} frames")
+            self.peers.reject(sender, "too many frames", error, refused)
+
+    def _warn_not_sent(self, error: Exception) -> None:
+        self._log.warning(str(error), "not sent over the link %s: %s", self.name, error)
+
+    def _tell_rejection(self, sender: str, reason: str, error: Exception) -> None:
+        self._log.warning((sender, reason), "refused what peer %s sent over the link %s: %s", sender, self.name, error)
+        # A copy has no traceback that would keep the message in memory.
+        self.bus._announce(PeerRejected(self.bus.clock.now(), self.name, sender, reason, copy(error)))
+
+    def _notify(self) -> None:
+        self.host.send_soon(self.outbox.pending)
+
+
+class ForeignEnd(Endpoint):
+    """The end of a link to a world whose messages have neither origins nor numbers.
+
+    Parameters
+    ----------
+    bus, name, frames, drop_lost, max_frames
+        As for `Endpoint`.
+    carrier : Carrier
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        name: str,
+        carrier: Carrier,
+        frames: Collection[str] | None = None,
+        drop_lost: bool = False,
+        max_frames: int = 10_000,
+    ) -> None:
+        super().__init__(bus, name, frames, drop_lost, max_frames)
+        self.id = carrier.id
+        self._carrier = carrier
+        self._splits = carrier if isinstance(carrier, SplittingCarrier) else None
+        self.outbox = LatchingOutbox(self.frames, self._notify)
+
+    async def open(self) -> None:
+        await self._carrier.open(self.host.receive, self.report)
+
+    async def run(self) -> None:
+        await self._carrier.run()
+
+    async def close(self) -> None:
+        await self._carrier.close()
+
+    def detach(self) -> None:
+        for peer in self.peers.forget_all():
+            self.relay.lose_foreign(peer, self.outbox, drop=False)
+        self.relay.detach(self.outbox)
+
+    def split(self, item: Received) -> Iterator[Any]:
+        return super().split(item) if self._splits is None else self._splits.split(item.content)
+
+    def _send(self, turn: Turn) -> None:
+        self._carrier.send(turn)
+
+    def _lose(self, peer: Peer) -> tuple[str, ...]:
+        return self.relay.lose_foreign(peer, self.outbox, self.drop_lost)
+
+    def _take(self, sender: str, content: Any) -> None:
+        message = self._carrier.read(content)
+        if message.time is not None:
+            self._hear_time(sender, message.time)
+        peer = self.peers.find(sender)
+        if peer is None or self.bus.closed:
+            return
+        if not message.continues:
+            self.messages += 1
+        for error in message.errors:
+            self.peers.reject(sender, error.reason, error)
+        for batch in message.batches:
+            if self.bus.closed or not self.peers.admit_authorities(peer, batch.authorities, len(batch.samples)):
+                continue
+            samples = batch.samples
+            if self.frames is not None:
+                samples = [sample for sample in samples if sample.child in self.frames]
+            published, refused = self.relay.publish_foreign(self.outbox, peer, samples, self.max_frames)
+            self._count(sender, len(samples), published, refused)

@@ -1,0 +1,408 @@
+"""Lookups in the buffers of other processes: a link asks, and a `BufferServer` of another link answers.
+
+A question goes to one peer of the robot that serves a buffer; its signs of life say so. It waits there as any lookup
+of that buffer does, for `LONGEST_WAIT` at most; then the asker is told what is missing, and asks again if it still
+wants to know. One that is given up is cancelled there. What comes from strangers passes `tfbus.links.remote_lookup`.
+"""
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+from time import monotonic
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import anyio
+import anyio.abc
+
+from tfbus._aio.task_groups import close_task_group
+from tfbus.buffer.buffer import Buffer
+from tfbus.buffer.lookups import MAY_COME
+from tfbus.bus.queues import check_capacity
+from tfbus.bus.subscribers import OnceLogger
+from tfbus.errors import LookupTimeoutError, RemoteLookupError, TransformError, TransformLookupError
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links.message import Kind, write_body
+from tfbus.links.remote_lookup import (
+    Cancellation,
+    RemoteQuestion,
+    as_timeout,
+    read_answer,
+    read_question,
+    write_answer,
+    write_question,
+)
+from tfbus.statistics import BufferServerStatistics
+from tfbus.tree.lookup import Hold
+
+LONGEST_WAIT = 10.0
+"""s; then the asker is told what is missing."""
+PATIENCE = 3.0
+"""s; so long an asker waits for a server that it has not met, and for an answer that is late."""
+_MOST_SILENCES = 3
+_NUMBER = 8
+"""Bytes of the number of a question, before what it says."""
+
+
+class Answers(Protocol):
+    """A buffer that is served over a link."""
+
+    def take(self, asker: str, number: int, data: bytes) -> None:
+        """Take a question or a cancellation of a link, by the link's number of the question."""
+
+    def lose(self, asker: str) -> None:
+        """Cancel the questions of a link that has gone."""
+
+
+class _Pending:
+    """A question that was sent: `done` is set when it has an answer, or will have none."""
+
+    __slots__ = ("answer", "done", "peer")
+
+    def __init__(self, peer: str) -> None:
+        self.peer = peer
+        self.answer: bytes | None = None
+        self.done = anyio.Event()
+
+
+class RemoteLookups:
+    """The lookups of one link, those that it asks and those that it is asked.
+
+    Parameters
+    ----------
+    send : callable
+        Sends a message to a link; returns False if it is known not to arrive.
+    id : str
+        The name of this link.
+    domain : str
+    capacity : int
+        How many questions may wait for their answers at once.
+
+    Attributes
+    ----------
+    server : Answers or None
+        The buffer that this link serves.
+    """
+
+    def __init__(self, send: Callable[[str, bytes], bool], id: str, domain: str, capacity: int = 10_000) -> None:  # noqa: A002
+        self._send = send
+        self._id = id
+        self._domain = domain
+        self._capacity = capacity
+        self._number = 0
+        self._pending: dict[int, _Pending] = {}
+        # The peers that serve a buffer, and their robots.
+        self._servers: dict[str, str] = {}
+        self._changed = anyio.Event()
+        self._is_open = False
+        self.server: Answers | None = None
+
+    # What comes
+
+    def open(self) -> None:
+        """The link is there."""
+        self._is_open = True
+
+    def close(self) -> None:
+        """The link ends."""
+        self._is_open = False
+        for peer in list(self._servers):
+            self.left(peer)
+        for pending in self._pending.values():
+            pending.done.set()
+
+    def note_server(self, peer: str, robot: str, serves: bool) -> None:
+        """Note whether a peer serves a buffer."""
+        if serves != (peer in self._servers):
+            if serves:
+                self._servers[peer] = robot
+            else:
+                del self._servers[peer]
+            # It wakes all that wait now, and none that waits later.
+            self._changed.set()
+            self._changed = anyio.Event()
+
+    def left(self, peer: str) -> None:
+        """Note that a link has gone."""
+        self.note_server(peer, "", serves=False)
+        for pending in self._pending.values():
+            if pending.peer == peer:
+                pending.done.set()
+        if self.server is not None:
+            self.server.lose(peer)
+
+    def asked(self, asker: str, data: bytes) -> None:
+        """Take a question of a link."""
+        if self.server is not None and len(data) > _NUMBER:
+            self.server.take(asker, int.from_bytes(data[:_NUMBER], "little"), data[_NUMBER:])
+
+    def answered(self, peer: str, data: bytes) -> None:
+        """Take an answer of a link: its number, and what it says."""
+        pending = self._pending.get(int.from_bytes(data[:_NUMBER], "little"))
+        if pending is not None and pending.peer == peer and len(data) > _NUMBER:
+            pending.answer = data[_NUMBER:]
+            pending.done.set()
+
+    def answer(self, asker: str, number: int, answer: bytes) -> bool:
+        """Send an answer to a link; returns False if it is known not to arrive."""
+        return self._send(asker, write_body(Kind.LOOKUP_ANSWER, number.to_bytes(_NUMBER, "little") + answer))
+
+    def refusal(self, reason: str, detail: str) -> bytes:
+        """An answer that refuses a question."""
+        return write_answer(self._error(None, reason, detail))
+
+    # What is asked
+
+    async def ask(self, question: RemoteQuestion, robot: str | None, limit: float) -> TransformStamped:
+        """Ask a link of a robot that serves a buffer, until there is an answer; the errors are those of `lookup`."""
+        until = monotonic() + limit
+        silences = 0
+        while True:
+            server = await self._find_server(robot, until)
+            left = max(until - monotonic(), 0.0)
+            try:
+                return await self._ask(server, question, robot, min(left, LONGEST_WAIT))
+            except RemoteLookupError as error:
+                # A congested network drops questions and answers.
+                silences += 1
+                if error.reason != "silent" or silences > _MOST_SILENCES or monotonic() >= until:
+                    raise
+            except LookupTimeoutError as error:
+                missing = error.__cause__
+                if monotonic() >= until or left <= LONGEST_WAIT:
+                    if not isinstance(missing, TransformLookupError):
+                        missing = error
+                    target, source = question.target, question.source
+                    raise LookupTimeoutError(target=target, source=source, timeout=limit, missing=missing) from missing
+
+    async def _find_server(self, robot: str | None, until: float) -> str:
+        with anyio.move_on_after(min(PATIENCE, max(until - monotonic(), 0.0))):
+            while self._is_open and self._server_of(robot) is None:
+                await self._changed.wait()
+        if not self._is_open:
+            raise self._error(robot, "lost", "this link has ended")
+        server = self._server_of(robot)
+        if server is None:
+            raise self._error(robot, "absent", "nobody offers it")
+        return server
+
+    def _server_of(self, robot: str | None) -> str | None:
+        return next((peer for peer, of in self._servers.items() if of == (robot or "")), None)
+
+    async def _ask(self, server: str, question: RemoteQuestion, robot: str | None, timeout: float) -> TransformStamped:
+        if len(self._pending) >= self._capacity:
+            raise RuntimeError(f"{self._capacity} lookups wait on this link already")
+        self._number = number = self._number + 1
+        pending = self._pending[number] = _Pending(server)
+        answered = False
+        try:
+            if not self._put(server, number, write_question(question, number, timeout)):
+                raise self._error(robot, "silent", "the question could not be sent")
+            with anyio.move_on_after(timeout + PATIENCE):
+                await pending.done.wait()
+                answered = True
+        finally:
+            del self._pending[number]
+            if not answered:
+                self._put(server, number, write_question(Cancellation(self._id, number)))
+        if not answered:
+            raise self._error(robot, "silent", f"it has not answered within {timeout + PATIENCE:g} s")
+        if pending.answer is None:
+            raise self._error(robot, "lost", "it has gone" if self._is_open else "this link has ended")
+        answer = read_answer(pending.answer, self._domain, robot, question)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def _put(self, server: str, number: int, body: bytes) -> bool:
+        return self._send(server, write_body(Kind.LOOKUP, number.to_bytes(_NUMBER, "little") + body))
+
+    def _error(self, robot: str | None, reason: str, detail: str) -> RemoteLookupError:
+        return RemoteLookupError(domain=self._domain, robot=robot, reason=reason, detail=detail)
+
+
+class Serving(Protocol):
+    """A link that can serve a buffer."""
+
+    @property
+    def lookups(self) -> RemoteLookups:
+        """The lookups of the link; raises `RuntimeError` unless it is entered."""
+
+    def serve(self, server: Answers | None) -> None:
+        """Say to all peers whether this link serves a buffer."""
+
+
+class BufferServer:
+    """Answers lookups of other processes from a buffer: ``async with BufferServer(buffer, link)``.
+
+    A lookup waits here as any lookup of the buffer does; `DomainLink.lookup` asks. It is what a BufferServer is in tf2.
+
+    Parameters
+    ----------
+    buffer : Buffer
+    link : DomainLink
+        An entered link of tfbus; it serves one buffer. Its robot is what askers name.
+    capacity : int
+        How many lookups may wait at once; beyond that they are refused.
+    rate : float
+        How many lookups are taken in a second, and at once (one at least); beyond that they are refused.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If an argument is out of range or of another type.
+    RuntimeError
+        On entering a second time, while the link is not entered, or if it serves a buffer already.
+
+    Notes
+    -----
+    Where one robot has several servers, one of them answers. Anyone who can reach the link can ask it.
+    """
+
+    def __init__(self, buffer: Buffer, link: Serving, *, capacity: int = 1_000, rate: float = 10_000.0) -> None:
+        check_capacity(capacity)
+        # Not a number is not greater either.
+        if not rate > 0:
+            raise ValueError(f"a rate must be greater than zero, got {rate!r} Hz")
+        self._buffer = buffer
+        self._link = link
+        self._capacity = capacity
+        self._rate = rate
+        self._allowance = self._most_at_once = max(rate, 1.0)
+        self._refilled = monotonic()
+        self._entered = False
+        self._waiting: dict[tuple[str, int], anyio.CancelScope] = {}
+        self._counts: Counter[str] = Counter()
+        self._log = OnceLogger(logging.getLogger("tfbus"))
+        self._lookups: RemoteLookups
+        self._tasks: anyio.abc.TaskGroup | None = None
+
+    def statistics(self) -> BufferServerStatistics:
+        """All counters, as they are now."""
+        counts = self._counts
+        return BufferServerStatistics(
+            waiting=len(self._waiting),
+            answered=counts["answered"],
+            failed=counts["failed"],
+            cancelled=counts["cancelled"],
+            refused={reason: counts[reason] for reason in ("busy", "malformed", "internal") if counts[reason]},
+        )
+
+    async def __aenter__(self) -> Self:
+        if self._entered:
+            raise RuntimeError("a buffer server is entered once: make another one")
+        self._lookups = self._link.lookups
+        if self._lookups.server is not None:
+            raise RuntimeError("this link serves a buffer already")
+        self._entered = True
+        self._tasks = await anyio.create_task_group().__aenter__()
+        self._link.serve(self)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        assert self._tasks is not None
+        tasks, self._tasks = self._tasks, None
+        self._link.serve(None)
+        tasks.cancel_scope.cancel()
+        await close_task_group(tasks)
+
+    def take(self, asker: str, number: int, data: bytes) -> None:
+        """Answer a question that can be answered now, else let it wait. Called by the link."""
+        key = asker, number
+        try:
+            question = read_question(data)
+        except ValueError as error:
+            self._refuse(*key, "malformed", f"the question cannot be read: {error}")
+            return
+        if isinstance(question, Cancellation):
+            self._cancel(key)
+        elif not self._admit():
+            self._refuse(*key, "busy", f"more than {self._rate:g} lookups come in a second")
+        elif key in self._waiting:
+            self._refuse(*key, "malformed", "the number of the question was used before")
+        else:
+            self._take(key, question)
+
+    def lose(self, asker: str) -> None:
+        """Cancel the questions of a link that has gone. Called by the link."""
+        for key in [key for key in self._waiting if key[0] == asker]:
+            self._cancel(key)
+
+    def _take(self, key: tuple[str, int], question: RemoteQuestion) -> None:
+        try:
+            answer: TransformStamped | Exception = self._buffer.lookup_nowait(**_arguments(question))
+        except MAY_COME:
+            if self._tasks is None:
+                return
+            if len(self._waiting) >= self._capacity:
+                self._refuse(*key, "busy", f"{self._capacity} lookups wait there, and no more may")
+                return
+            self._waiting[key] = scope = anyio.CancelScope()
+            self._tasks.start_soon(self._wait, key, question, scope)
+            return
+        except Exception as error:  # noqa: BLE001 - it is told to the asker
+            answer = error
+        self._answer(key, answer)
+
+    async def _wait(self, key: tuple[str, int], question: RemoteQuestion, scope: anyio.CancelScope) -> None:
+        answer: TransformStamped | Exception | None = None
+        with scope:
+            try:
+                timeout = as_timeout(question.timeout, LONGEST_WAIT)
+                answer = await self._buffer.lookup(**_arguments(question), timeout=timeout)
+            except Exception as error:  # noqa: BLE001 - it is told to the asker
+                answer = error
+            finally:
+                self._waiting.pop(key, None)
+        if answer is not None:
+            self._answer(key, answer)
+
+    def _answer(self, key: tuple[str, int], answer: TransformStamped | Exception) -> None:
+        """Count an answer and send it; no error of one question ends the task."""
+        try:
+            if isinstance(answer, Exception) and not isinstance(answer, (TransformError, TypeError, ValueError)):
+                # As one that cannot be written.
+                raise answer
+            message = write_answer(answer)
+        except Exception as error:  # noqa: BLE001 - the next question is answered
+            self._log.warning(type(error), "a lookup of another process failed", exc_info=error)
+            self._refuse(*key, "internal", f"the lookup failed there with {type(error).__name__}")
+        else:
+            self._counts["failed" if isinstance(answer, Exception) else "answered"] += 1
+            self._lookups.answer(*key, message)
+
+    def _admit(self) -> bool:
+        now = monotonic()
+        self._allowance = min(self._most_at_once, self._allowance + (now - self._refilled) * self._rate)
+        self._refilled = now
+        if self._allowance < 1:
+            return False
+        self._allowance -= 1
+        return True
+
+    def _cancel(self, key: tuple[str, int]) -> None:
+        scope = self._waiting.pop(key, None)
+        if scope is not None:
+            self._counts["cancelled"] += 1
+            scope.cancel()
+
+    def _refuse(self, asker: str, number: int, reason: str, detail: str) -> None:
+        self._counts[reason] += 1
+        self._lookups.answer(asker, number, self._lookups.refusal(reason, detail))
+
+
+def _arguments(question: RemoteQuestion) -> dict[str, Any]:
+    return {
+        "target": question.target,
+        "source": question.source,
+        "at": question.at,
+        "max_age": question.max_age,
+        "source_at": question.source_at,
+        "fixed": question.fixed,
+        "tolerance": question.tolerance,
+        "max_gap": question.max_gap,
+        "extrapolate": None if question.hold is None else Hold(question.hold),
+    }
+

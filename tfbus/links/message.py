@@ -1,0 +1,414 @@
+"""The messages between links of tfbus, as bytes.
+
+A message says what ROS's TFMessage cannot: the origin, number and authority of its samples, removals, and what the
+sender holds. The samples themselves are a TFMessage behind that. Little endian::
+
+    version u8, kind u8, flags u8, reach u8, origins u16, authorities u16, entries u32, number u64, bus 16 bytes
+    since u64, sequence u64, digest u64: a `Claim`
+    time         i64, the time of the sender's clock in ns, if the flags say so
+    reach        origin 16 bytes, length u8, and so many buses on the way there, 16 bytes each
+    origins      16 bytes each
+    authorities  length u16, UTF-8
+    entries      kind u8, origin u16, runs u16, sequence u64, and then
+        batch    runs times: authority u16, static u16, samples u32
+        removal  the length of the name in place of runs, UTF-8
+    samples      a TFMessage with the samples of all batches, in their order
+
+The kinds are those of `tfbus.links.replica`, and those of the past and of lookups. Questions are JSON behind version and
+kind; see `tfbus.links.lookups` for theirs. Reading a message costs time in proportion to its bytes; handling an entry may cost more, so both have a
+limit.
+"""
+
+import enum
+import json
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain, groupby, repeat
+from typing import Any, NamedTuple
+
+from tfbus.errors import InvalidTransformError
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links.outbox import OutgoingBatch, RemovedFrame
+from tfbus.links.relay import ReceivedBatch, ReceivedTransform
+from tfbus.links.replica import Claim
+from tfbus.tf_message import MAX_NAME, MIN_SIZE, MalformedMessageError, decode, decode_in_parts, encode, refusal
+
+VERSION = 3
+MAX_BYTES = 2**22
+"""The largest message with samples that is sent or read."""
+MAX_HEAD = 2**20
+"""The largest part of a message before its samples."""
+MAX_TEXT = 2**17
+"""The largest message of JSON."""
+MAX_ENTRIES = 10_000
+MAX_SAMPLES = 10_000
+"""The largest batch that is sent or accepted: a bus publishes it in one turn of the loop, all or nothing."""
+LONGEST_WAY = 8
+"""A bus is reached over so many others at most."""
+_LARGE = 2**15
+"""Bytes; a message beyond is read in parts."""
+_PART = 200
+"""So many samples, or entries, of a large message are decoded, or handled, before other tasks may have their turn."""
+_LONGEST_AUTHORITY = 65_535
+
+_HEADER = struct.Struct("<BBBBHHIQ16sQQQ")
+_ENTRY = struct.Struct("<BHHQ")
+_RUN = struct.Struct("<HHI")
+_LENGTH = struct.Struct("<H")
+_TIME = struct.Struct("<q")
+_BATCH, _REMOVAL = 0, 1
+_FINAL, _PARTIAL, _HAS_TIME, _SERVES = 1, 2, 4, 8
+_BUS = 16
+
+Entry = OutgoingBatch | RemovedFrame
+NOTHING = Claim(0, 0, 0)
+Way = tuple[bytes, tuple[bytes, ...]]
+"""A bus that is reached, and the buses on the way there."""
+
+
+class Kind(enum.IntEnum):
+    """What a message is for."""
+
+    LIVE = 1
+    SIGN = 2
+    MEETING = 3
+    QUESTION = 4
+    ANSWER = 5
+    PAST_QUESTION = 6
+    PAST = 7
+    LOOKUP = 8
+    LOOKUP_ANSWER = 9
+
+
+TEXTS = frozenset({Kind.QUESTION, Kind.PAST_QUESTION, Kind.LOOKUP, Kind.LOOKUP_ANSWER})
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """What goes out with the entries of a message.
+
+    Attributes
+    ----------
+    kind : Kind
+    bus : bytes
+        The sender's own bus.
+    number : int
+        That of a live message on its channel, or of the newest one before a sign; 0 for others.
+    claim : Claim
+    time : int or None
+    reach : sequence of Way
+    serves : bool
+        Whether the sender answers lookups.
+    """
+
+    kind: Kind
+    bus: bytes
+    number: int = 0
+    claim: Claim = NOTHING
+    time: int | None = None
+    reach: Sequence[Way] = ()
+    serves: bool = False
+
+
+@dataclass(slots=True)
+class Heard:
+    """A message, or a part of one, as it came; `Outgoing` has the meaning of its first attributes.
+
+    Attributes
+    ----------
+    entries : list of ReceivedBatch or RemovedFrame
+        In the order in which it happened.
+    errors : list of InvalidTransformError
+        One for each sample that was refused; `entries` have the others.
+    continues : bool
+        Whether it is a later part of a message.
+    goes_on : bool
+        Whether a later part follows; only after the last one the claim holds.
+    """
+
+    kind: Kind
+    bus: bytes
+    number: int
+    claim: Claim
+    time: int | None
+    reach: Sequence[Way]
+    serves: bool
+    entries: list[ReceivedBatch | RemovedFrame]
+    errors: list[InvalidTransformError] = field(default_factory=list)
+    continues: bool = False
+    goes_on: bool = False
+
+
+class Text(NamedTuple):
+    """A message of JSON, as it came; `data` is its body."""
+
+    kind: Kind
+    data: bytes
+
+
+# Writing
+
+
+def write_message(out: Outgoing, entries: Sequence[Entry] = ()) -> bytes:
+    """The bytes of a message.
+
+    Raises
+    ------
+    ValueError
+        If one message cannot hold all entries: there are too many of anything, a name or an authority is too long or
+        cannot be written in UTF-8, or all together are too large.
+    """
+    samples: list[TransformStamped] = []
+    for entry in entries:
+        if type(entry) is OutgoingBatch:
+            samples += entry.samples
+    if len(samples) > MAX_SAMPLES:
+        raise ValueError(f"a message of {len(samples)} samples, more than {MAX_SAMPLES}")
+    head = _head(out, entries)
+    message = head + encode(samples) if samples else head
+    if len(message) > MAX_BYTES:
+        raise ValueError(f"a message of {len(samples)} samples has {len(message)} bytes, more than {MAX_BYTES}")
+    return message
+
+
+def write_text(kind: Kind, fields: dict[str, Any]) -> bytes:
+    """The bytes of a message of JSON."""
+    return write_body(kind, json.dumps(fields).encode())
+
+
+def write_body(kind: Kind, body: bytes) -> bytes:
+    """The bytes of a message whose body is somebody else's to read."""
+    return bytes((VERSION, kind)) + body
+
+
+def can_hold(sample: TransformStamped) -> bool:
+    """Whether a message can hold a sample."""
+    return reason_not_to_send(sample) is None
+
+
+def reason_not_to_send(sample: TransformStamped) -> InvalidTransformError | None:
+    """Why a sample cannot be in a message; None if it can."""
+    try:
+        size = len(sample.authority.encode())
+    except UnicodeEncodeError:
+        why = "cannot be written in UTF-8"
+    else:
+        if size <= _LONGEST_AUTHORITY:
+            return refusal(sample)
+        why = f"has {size} bytes, more than {_LONGEST_AUTHORITY}"
+    return InvalidTransformError(
+        f"an authority {why}", reason="authority", parent=sample.parent, child=sample.child, authority=sample.authority
+    )
+
+
+def size_of(entry: Entry) -> int:
+    """How many samples and removals an entry is."""
+    return len(entry.samples) if type(entry) is OutgoingBatch else 1
+
+
+def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
+    if len(entries) > MAX_ENTRIES:
+        raise ValueError(f"too much for one message: {len(entries)} entries, more than {MAX_ENTRIES}")
+    origins: dict[bytes, int] = {}
+    authorities: dict[str, int] = {}
+    body = bytearray()
+    for entry in entries:
+        origin = origins.setdefault(entry.origin, len(origins))
+        if isinstance(entry, RemovedFrame):
+            name = entry.frame.encode()
+            if len(name) > MAX_NAME:
+                raise ValueError(f"too much for one message: a frame name of {len(name)} bytes")
+            body += _pack(_ENTRY, _REMOVAL, origin, len(name), entry.sequence) + name
+            continue
+        runs = [
+            (tag, sum(1 for _ in samples))
+            for tag, samples in groupby(entry.samples, lambda sample: (sample._fields[4], sample._fields[5]))
+        ]
+        body += _pack(_ENTRY, _BATCH, origin, len(runs), entry.sequence)
+        for (authority, static), count in runs:
+            body += _pack(_RUN, authorities.setdefault(authority, len(authorities)), static, count)
+    claim = out.claim
+    flags = _FINAL * claim.final | _PARTIAL * claim.partial | _HAS_TIME * (out.time is not None) | _SERVES * out.serves
+    counts = len(out.reach), len(origins), len(authorities), len(entries)
+    head = bytearray(
+        _pack(
+            _HEADER, VERSION, out.kind, flags, *counts, out.number, out.bus, claim.since, claim.sequence, claim.digest
+        )
+    )
+    if out.time is not None:
+        head += _TIME.pack(out.time)
+    for bus, path in out.reach:
+        head += bus + bytes((len(path),)) + b"".join(path)
+    head += b"".join(origins)
+    for authority in authorities:
+        text = authority.encode()
+        head += _pack(_LENGTH, len(text)) + text
+    if len(head) + len(body) > MAX_HEAD:
+        raise ValueError(f"too much for one message: {len(head) + len(body)} bytes before the samples")
+    return bytes(head + body)
+
+
+def _pack(layout: struct.Struct, *values: object) -> bytes:
+    try:
+        return layout.pack(*values)
+    except struct.error as error:
+        raise ValueError(f"too much for one message: {error}") from None
+
+
+# Reading
+
+
+class _Batch(NamedTuple):
+    """A batch as the head of a message tells it: its runs are authority, static flag and number of samples."""
+
+    origin: bytes
+    sequence: int
+    runs: tuple[tuple[str, bool, int], ...]
+
+    @property
+    def count(self) -> int:
+        return sum(count for _, _, count in self.runs)
+
+
+def kind_of(data: bytes) -> Kind | None:
+    """The kind of a message; None if it is of no known kind or version."""
+    if len(data) < 2 or data[0] != VERSION:
+        return None
+    try:
+        return Kind(data[1])
+    except ValueError:
+        return None
+
+
+def read_message(data: bytes) -> Iterator[Heard | Text | None]:
+    """A message, in parts if it is large, with each batch whole; None where other tasks may have their turn.
+
+    Nothing of a malformed message is a part: all of it is decoded before the first one.
+
+    Raises
+    ------
+    MalformedMessageError
+        If the data are no message of this version.
+    """
+    kind = kind_of(data)
+    if kind is None:
+        raise MalformedMessageError("version", f"expected a message of version {VERSION}, got {data[:2]!r}")
+    if kind in TEXTS:
+        if len(data) > MAX_TEXT:
+            raise MalformedMessageError("oversized", f"a text of {len(data)} bytes, more than {MAX_TEXT}")
+        yield Text(kind, data[2:])
+        return
+    if len(data) > MAX_BYTES:
+        raise MalformedMessageError("oversized", f"{len(data)} bytes, more than {MAX_BYTES}")
+    try:
+        heard, told, end = _read_head(kind, data)
+    except (struct.error, IndexError):
+        detail = f"the head of a message of {len(data)} bytes is cut off or inconsistent"
+        raise MalformedMessageError("head", detail) from None
+    except UnicodeDecodeError:
+        raise MalformedMessageError("head", "a name in a message is no UTF-8") from None
+    count = sum(entry.count for entry in told if isinstance(entry, _Batch))
+    # A number that the data cannot hold is malformed, and is told as such.
+    if MAX_SAMPLES < count <= len(data) // MIN_SIZE:
+        raise MalformedMessageError("oversized", f"a message of {count} samples, more than {MAX_SAMPLES}")
+    tags = chain.from_iterable(
+        repeat((authority, static), size)
+        for entry in told
+        if isinstance(entry, _Batch)
+        for authority, static, size in entry.runs
+    )
+    samples: list[ReceivedTransform | None] = []
+    if count or end < len(data):
+        payload = data[end:]
+        if len(data) > _LARGE:
+            yield None
+            for decoded in decode_in_parts(payload, _PART, ReceivedTransform, tags=tags):
+                samples += decoded.samples
+                heard.errors += decoded.errors
+                yield None
+        else:
+            samples, heard.errors = decode(payload, tags, ReceivedTransform)
+    place = size = 0
+    for entry in told:
+        if size >= _PART:
+            heard.goes_on = True
+            yield heard
+            size, heard = 0, replace(heard, time=None, entries=[], errors=[], continues=True, goes_on=False)
+        if isinstance(entry, RemovedFrame):
+            size += 1
+            heard.entries.append(entry)
+            continue
+        valid = [sample for sample in samples[place : place + entry.count] if sample is not None]
+        place += entry.count
+        size += 1 + entry.count
+        authorities = [authority for authority, _, _ in entry.runs]
+        heard.entries.append(ReceivedBatch(valid, authorities, entry.origin, entry.sequence))
+    yield heard
+
+
+def read_fields(data: bytes) -> dict[str, Any]:
+    """The JSON object in the body of a text.
+
+    Raises
+    ------
+    MalformedMessageError
+        If there is none.
+    """
+    try:
+        fields = json.loads(data)
+    except (ValueError, RecursionError):
+        fields = None
+    if not isinstance(fields, dict):
+        raise MalformedMessageError("text", f"no JSON object: {data[:40]!r}")
+    return fields
+
+
+def _read_head(kind: Kind, data: bytes) -> tuple[Heard, list[_Batch | RemovedFrame], int]:
+    _, _, flags, ways, origin_count, authority_count, entry_count, number, bus, *claimed = _HEADER.unpack_from(data)
+    if entry_count > MAX_ENTRIES:
+        raise MalformedMessageError("oversized", f"a message of {entry_count} entries, more than {MAX_ENTRIES}")
+    since, sequence, digest = claimed
+    if since > sequence:
+        raise IndexError
+    at, time = _HEADER.size, None
+    if flags & _HAS_TIME:
+        (time,) = _TIME.unpack_from(data, at)
+        at += _TIME.size
+    reach: list[Way] = []
+    for _ in range(ways):
+        length = data[at + _BUS]
+        if length > LONGEST_WAY:
+            raise IndexError
+        path = [data[at + 1 + _BUS * (k + 1) : at + 1 + _BUS * (k + 2)] for k in range(length)]
+        reach.append((data[at : at + _BUS], tuple(path)))
+        at += _BUS * (length + 1) + 1
+    origins = [data[at + _BUS * k : at + _BUS * (k + 1)] for k in range(origin_count)]
+    at += _BUS * origin_count
+    authorities = []
+    for _ in range(authority_count):
+        (length,) = _LENGTH.unpack_from(data, at)
+        at += _LENGTH.size
+        authorities.append(data[at : at + length].decode())
+        at += length
+    entries: list[_Batch | RemovedFrame] = []
+    # Each entry takes some bytes, so a false count ends the loop with an error before the list grows long.
+    for _ in range(entry_count):
+        entry_kind, origin, size, entry_number = _ENTRY.unpack_from(data, at)
+        at += _ENTRY.size
+        if entry_kind == _REMOVAL and size <= MAX_NAME:
+            entries.append(RemovedFrame(origins[origin], entry_number, data[at : at + size].decode()))
+            at += size
+        elif entry_kind == _BATCH:
+            runs = _RUN.iter_unpack(data[at : at + _RUN.size * size])
+            at += _RUN.size * size
+            named = tuple((authorities[authority], bool(static), count) for authority, static, count in runs)
+            entries.append(_Batch(origins[origin], entry_number, named))
+        else:
+            raise IndexError
+    # Slicing past the end raises nothing, so the end is checked.
+    if at > len(data) or at > MAX_HEAD:
+        raise IndexError
+    claim = Claim(since, sequence, digest, bool(flags & _FINAL), bool(flags & _PARTIAL))
+    return Heard(kind, bus, number, claim, time, reach, bool(flags & _SERVES), []), entries, at
+

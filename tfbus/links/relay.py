@@ -1,0 +1,566 @@
+"""The relay of a bus: all its links share it, so that what comes by one goes out by the others, and nothing goes round.
+
+Every batch is numbered by the bus on which it was published first, its *origin*. The same batch may arrive on several
+ways, for a bus with two links passes on by each what came by the other. So a sample is news only if its number is
+higher than that of the newest sample of the same origin and child; then no ring of buses has an echo.
+
+A bus numbers on from the highest number that it has seen of any origin (Lamport, "Time, clocks, and the ordering of
+events in a distributed system", 1978). So of two things that are said of one frame, such as a static sample and a
+removal, the one of the higher number was said with the other in mind, or without knowing it; that one holds on every
+bus, in whatever order they come. The first number is the machine's time in microseconds, so that what a program says
+when it is started again holds against what it has said before, although it knows nothing of that.
+
+Batches of a world that has no origins, such as ROS, get this bus as their origin. Such a world gives back what it was
+sent, by another link of this bus or by another bus, and nothing in it tells. So while a link to such a world is
+attached, the relay remembers the newest samples of each child, and takes the same one for news only once.
+
+The relay also counts the ways to each bus, its *reach*: a link with `drop_lost` withdraws the frames of a bus that no
+way leads to any more. They are not removed: see `tfbus.links.replica`.
+"""
+
+import os
+from collections import Counter
+from collections.abc import Collection, Iterable
+from itertools import groupby
+from time import time_ns
+from typing import Any
+
+from tfbus.bus.bus import Bus
+from tfbus.errors import UnknownFrameError
+from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.links.outbox import LOWEST, Outbox, OutgoingBatch, Rank, RemovedFrame
+from tfbus.links.peers import Peer
+from tfbus.registration import Registration
+from tfbus.rows import Row
+
+LARGEST_JUMP = 2**52
+"""A number may be so far ahead of all that came before: 142 years in us, for some machines begin in 1970."""
+MANY_PEERS = 20
+"""All origins together may have so many times the frames that one of them may have."""
+MAX_ORIGINS = 10_000
+_REMEMBERED = 10_000
+_PER_CHILD = 256
+_GONE_CHILDREN = 1_000
+
+
+class Provenance:
+    """The source of a received batch or removal.
+
+    Attributes
+    ----------
+    origin : bytes
+        The bus on which it was published first, 16 bytes.
+    sequence : int
+        Its number on that bus; later ones have higher numbers.
+    outbox : Outbox or None
+        That of the link that brought it: what came in there does not go out there. None for this bus's own.
+    peer : Peer or None
+        The other end of that link; None for this bus's own.
+    """
+
+    __slots__ = ("origin", "outbox", "peer", "sequence")
+
+    def __init__(self, origin: bytes, sequence: int, outbox: Outbox | None = None, peer: Peer | None = None) -> None:
+        self.origin = origin
+        self.sequence = sequence
+        self.outbox = outbox
+        self.peer = peer
+
+    @property
+    def rank(self) -> Rank:
+        """Of two things that were said of a frame, the one of the higher rank holds."""
+        return self.sequence, self.origin
+
+
+class ReceivedTransform(TransformStamped):
+    """A sample that came over a link; equal to one that did not."""
+
+    __slots__ = ("_provenance",)
+    _provenance: Provenance
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A copy in another process has not come over this link.
+        return TransformStamped, (self.parent, self.child, self.stamp, self.transform, self.authority, self.static)
+
+
+class ReceivedBatch:
+    """Samples of one batch, as they came in.
+
+    Attributes
+    ----------
+    samples : list of ReceivedTransform
+        Their provenance is not set yet.
+    authorities : collection of str
+        The authorities that the batch names; a peer may name only so many.
+    origin : bytes or None
+        The bus on which the batch was published first, 16 bytes; None if the sender knows no buses, as ROS.
+    sequence : int
+        The batch's number on that bus; without an origin it is not used.
+    """
+
+    __slots__ = ("authorities", "origin", "samples", "sequence")
+
+    def __init__(
+        self,
+        samples: list[ReceivedTransform],
+        authorities: Collection[str],
+        origin: bytes | None = None,
+        sequence: int = 0,
+    ) -> None:
+        self.samples = samples
+        self.authorities = authorities
+        self.origin = origin
+        self.sequence = sequence
+
+
+class Relay:
+    """Passes samples and removals between one bus and its links.
+
+    There is one relay a bus, from `relay_of`. While no link is attached, it does nothing and remembers nothing but its
+    origin and its numbers: by those the bus knows its own samples when its links have ended and others begin.
+
+    Parameters
+    ----------
+    bus : Bus
+    number : int
+        The number before the first one.
+
+    Attributes
+    ----------
+    origin : bytes
+        The name of this bus for others: 16 random bytes.
+    """
+
+    _registration: Registration
+
+    def __init__(self, bus: Bus, number: int) -> None:
+        self.origin = os.urandom(16)
+        self._number = number
+        self._bus = bus
+        self._outboxes: list[Outbox] = []
+        # The newest number of each frame, by origin, and how many that are in all.
+        self._newest: dict[bytes, dict[str, int]] = {}
+        self._frames = 0
+        self._latest: dict[str, Provenance] = {}
+        self._settled: dict[str, Rank] = {}
+        self._removed: dict[str, Rank] = {}
+        self._removing: tuple[str, Provenance | None] | None = None
+        self._ways: Counter[bytes] = Counter()
+        self._passed: PassedSamples | None = None
+
+    def attach(self, outbox: Outbox, foreign: bool = False) -> None:
+        """Give a link all that is latched, and all that is published from now on.
+
+        Parameters
+        ----------
+        outbox : Outbox
+        foreign : bool
+            Whether it is a link to a world whose samples have no origin.
+
+        Raises
+        ------
+        BusClosedError
+        """
+        if foreign and self._passed is None:
+            self._passed = PassedSamples()
+        if not self._outboxes:
+            self._registration = self._bus.subscribe(self._on_batch, self._on_removal)
+        self._bus.subscribe(lambda batch: self._send_latched(batch, outbox)).close()
+        self._outboxes.append(outbox)
+
+    def detach(self, outbox: Outbox) -> None:
+        """Give a link nothing any more."""
+        self._outboxes.remove(outbox)
+        if not self._outboxes:
+            self._registration.close()
+            self._newest.clear()
+            self._frames = 0
+            for by_frame in (self._latest, self._settled, self._removed):
+                by_frame.clear()
+            self._passed = None
+
+    def clock_jumped_back(self) -> None:
+        """Take samples with the stamps of earlier ones for news."""
+        if self._passed is not None:
+            self._passed.forget_moving()
+
+    def newest_number(self, frame: str) -> Rank | None:
+        """Number and origin of the newest batch with a frame; None if the frame is not there."""
+        latest = self._latest.get(frame)
+        return None if latest is None else latest.rank
+
+    def is_plausible(self, number: int) -> bool:
+        """Whether a number may be one that a bus has given by now."""
+        return number - self._number <= LARGEST_JUMP
+
+    # Samples and removals of peers
+
+    def publish(
+        self, received: Iterable[tuple[Provenance, Iterable[ReceivedTransform]]], max_frames: int
+    ) -> tuple[int, int]:
+        """Publish those samples of some received batches that are news, as one batch.
+
+        Parameters
+        ----------
+        received : iterable of (Provenance, iterable of ReceivedTransform)
+            All of one peer.
+        max_frames : int
+            How many frames one origin may have.
+
+        Returns
+        -------
+        published, refused : int
+            Samples that were published, and samples whose frames are too many; all others are no news.
+        """
+        news: list[ReceivedTransform] = []
+        refused = 0
+        for provenance, samples in received:
+            if provenance.origin != self.origin:
+                refused += self._find_news(provenance, samples, max_frames, news)
+            elif provenance.sequence > self._number:
+                self._outnumber(provenance.sequence, {sample.child for sample in samples})
+        if news:
+            self._bus.publish(news, invalid="drop")
+        return len(news), refused
+
+    def publish_foreign(
+        self, outbox: Outbox, peer: Peer, samples: Iterable[ReceivedTransform], max_frames: int
+    ) -> tuple[int, int]:
+        """Publish a batch of a world that has neither origins nor numbers; what went over this bus before is no news.
+
+        The batch gets this bus as its origin and the next number of this bus. It goes out by all links but the one that
+        brought it, whose outbox is `outbox`. Parameters and results are those of `publish`, but for `max_frames`, which
+        bounds the frames of the peer.
+        """
+        provenance = Provenance(self.origin, self._next_number(), outbox, peer)
+        news: list[ReceivedTransform] = []
+        refused = self._find_news(provenance, samples, max_frames, news)
+        if news:
+            self._bus.publish(news, invalid="drop")
+        return len(news), refused
+
+    def remove(self, provenance: Provenance, frame: str) -> None:
+        """Remove a frame from the bus, unless something newer was said of it."""
+        if provenance.origin == self.origin:
+            if provenance.sequence > self._number:
+                self._outnumber(provenance.sequence, {frame})
+            return
+        self._number = max(self._number, provenance.sequence)
+        latest = self._latest.get(frame)
+        newest = self._newest.get(provenance.origin, {}).get(frame, -1)
+        if (
+            newest < provenance.sequence
+            and provenance.rank > self._removed.get(frame, LOWEST)
+            and (latest is None or provenance.rank > latest.rank)
+        ):
+            self._remove_from_bus(frame, provenance)
+
+    def lose_foreign(self, peer: Peer, outbox: Outbox, drop: bool) -> tuple[str, ...]:
+        """Forget a peer of a world without origins; returns the frames that it was the last to bring, sorted.
+
+        With `drop`, this bus removes these frames, for it has answered for them.
+        """
+        frames = tuple(sorted(frame for frame, latest in self._latest.items() if latest.peer is peer))
+        if drop:
+            for frame in frames:
+                latest = self._latest.get(frame)
+                # A subscriber that hears of one removal may have removed or published others, or closed the bus.
+                if not self._bus.closed and latest is not None and latest.peer is peer:
+                    self._remove_from_bus(frame, Provenance(self.origin, self._next_number(), outbox, peer))
+        return frames
+
+    # Reach
+
+    def reaches(self, origin: bytes) -> bool:
+        """Whether a bus is reached on any way; this one always is."""
+        return origin == self.origin or self._ways[origin] > 0
+
+    def way_opened(self, origin: bytes) -> None:
+        """Count one more way to a bus."""
+        self._ways[origin] += 1
+
+    def way_closed(self, origin: bytes) -> bool:
+        """Count one way less to a bus; returns whether that was the last one."""
+        self._ways[origin] -= 1
+        if self._ways[origin] > 0:
+            return False
+        del self._ways[origin]
+        return True
+
+    def reach_besides(self, outbox: Outbox) -> dict[bytes, tuple[bytes, ...]]:
+        """The buses that other links than this one lead to, each with the buses on the shortest way there."""
+        found: dict[bytes, tuple[bytes, ...]] = {}
+        for other in self._outboxes:
+            if other is not outbox:
+                for origin, path in other.ways():
+                    if origin not in found or len(path) < len(found[origin]):
+                        found[origin] = path
+        return found
+
+    def reach_changed(self, outbox: Outbox) -> None:
+        """Let the other links than this one know that they have to tell a new reach."""
+        for other in self._outboxes:
+            if other is not outbox:
+                other.reach_changed()
+
+    def frames_of(self, origins: Collection[bytes]) -> list[str]:
+        """The frames on the bus whose newest sample is of one of some buses, sorted."""
+        return sorted(frame for frame, latest in self._latest.items() if latest.origin in origins)
+
+    def forget_origins(self, origins: Collection[bytes]) -> None:
+        """Forget the numbers of buses that have gone, but for those of frames that are here."""
+        for origin in origins:
+            newest = self._newest.get(origin, {})
+            for frame in list(newest):
+                latest = self._latest.get(frame)
+                if latest is None or latest.origin != origin:
+                    self._release(origin, frame)
+
+    def withdraw(self, frames: Iterable[str], origins: Collection[bytes]) -> None:
+        """Take frames off this bus whose newest sample is of some buses; nothing is said of them to others."""
+        for frame in frames:
+            latest = self._latest.get(frame)
+            # A subscriber may have changed things meanwhile.
+            if not self._bus.closed and latest is not None and latest.origin in origins:
+                self._remove_from_bus(frame, None)
+
+    # Inside
+
+    def _find_news(
+        self,
+        provenance: Provenance,
+        samples: Iterable[ReceivedTransform],
+        max_frames: int,
+        news: list[ReceivedTransform],
+    ) -> int:
+        """Add the samples of one batch that are news; returns how many others are of frames that are too many."""
+        refused, before = 0, len(news)
+        peer = provenance.peer
+        assert peer is not None
+        sequence, origin = provenance.sequence, provenance.origin
+        self._number = max(self._number, sequence)
+        rank = provenance.rank
+        newest = self._newest.get(origin)
+        if newest is None:
+            if len(self._newest) >= MAX_ORIGINS:
+                return len(list(samples))
+            newest = self._newest[origin] = {}
+        passed, foreign = self._passed, origin == self.origin
+        settled, removed = self._settled, self._removed
+        for sample in samples:
+            fields = sample._fields
+            child = fields[1]
+            # A static one with an origin has to be ranked, so that all buses agree in the end.
+            if passed is not None and (foreign or not fields[5]) and sample in passed:
+                continue
+            if (child in settled or child in removed or fields[5]) and self._is_outranked(sample, rank):
+                continue
+            known = newest.get(child)
+            if known is None:
+                held = len(peer.frames) if foreign else len(newest)
+                if held >= max_frames or self._frames >= MANY_PEERS * max_frames:
+                    refused += 1
+                    continue
+                if foreign:
+                    peer.frames.add(child)
+                # Other samples of the batch may be of the same child.
+                newest[child] = -1
+                self._frames += 1
+            elif known >= sequence:
+                continue
+            sample._provenance = provenance
+            news.append(sample)
+        for sample in news[before:] if before else news:
+            newest[sample._fields[1]] = sequence
+        if not newest:
+            del self._newest[origin]
+        return refused
+
+    def _remove_from_bus(self, frame: str, provenance: Provenance | None) -> None:
+        if frame not in self._latest:
+            # None of its samples was passed on, so no link has to be told.
+            self._forget_frame(frame, provenance)
+            return
+        self._removing = frame, provenance
+        try:
+            self._bus.remove_frame(frame)
+        except UnknownFrameError:
+            # The bus forgot it when its clock jumped back, but other buses did not.
+            self._on_removal(frame)
+        finally:
+            self._removing = None
+
+    def _on_batch(self, batch: Batch) -> None:
+        for provenance, group in groupby(batch, _provenance_of):
+            if provenance is None:
+                provenance = Provenance(self.origin, self._next_number())
+            samples = tuple(group)
+            for sample in samples:
+                fields = sample._fields
+                if self._passed is not None:
+                    self._passed.add(sample)
+                self._latest[fields[1]] = provenance
+                if fields[5]:
+                    self._settled[fields[1]] = provenance.rank
+            outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
+            for outbox in self._outboxes:
+                outbox.add_batch(outgoing, echo=outbox is provenance.outbox)
+
+    def _send_latched(self, batch: Batch, outbox: Outbox) -> None:
+        def known(sample: TransformStamped) -> Provenance | None:
+            return _provenance_of(sample) or self._latest.get(sample.child)
+
+        for provenance, group in groupby(batch, known):
+            if provenance is None:
+                provenance = Provenance(self.origin, self._next_number())
+            samples = tuple(group)
+            for sample in samples:
+                if self._passed is not None:
+                    self._passed.add(sample)
+                self._latest[sample.child] = provenance
+                self._settled[sample.child] = provenance.rank
+            outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
+            outbox.add_batch(outgoing, echo=outbox is provenance.outbox)
+
+    def _on_removal(self, frame: str) -> None:
+        if self._removing is not None and self._removing[0] == frame:
+            provenance = self._removing[1]
+        else:
+            provenance = Provenance(self.origin, self._next_number())
+        latest = self._latest.pop(frame, None)
+        self._forget_frame(frame, provenance)
+        if provenance is not None:
+            removal = RemovedFrame(provenance.origin, provenance.sequence, frame)
+            for outbox in self._outboxes:
+                outbox.add_removal(removal, echo=outbox is provenance.outbox)
+        elif latest is not None:
+            withdrawal = RemovedFrame(latest.origin, latest.sequence, frame)
+            for outbox in self._outboxes:
+                outbox.add_removal(withdrawal, echo=outbox is latest.outbox, withdrawn=True)
+
+    def _forget_frame(self, frame: str, provenance: Provenance | None) -> None:
+        """Forget what holds for a frame that has gone, by a removal or, without one, because its owner was lost."""
+        self._settled.pop(frame, None)
+        if self._passed is not None:
+            # A sample that was withdrawn may come again just as it was.
+            (self._passed.forget if provenance is None else self._passed.retire)(frame)
+        if provenance is not None:
+            self._removed.pop(frame, None)
+            self._removed[frame] = provenance.rank
+            if len(self._removed) > _REMEMBERED:
+                del self._removed[next(iter(self._removed))]
+        for origin in [origin for origin, newest in self._newest.items() if frame in newest]:
+            self._release(origin, frame)
+
+    def _release(self, origin: bytes, frame: str) -> None:
+        newest = self._newest[origin]
+        del newest[frame]
+        self._frames -= 1
+        if not newest:
+            del self._newest[origin]
+
+    def _is_outranked(self, sample: ReceivedTransform, rank: Rank) -> bool:
+        """Whether something else that was said of the frame holds: a removal, or a static sample of another bus."""
+        _, child, _, _, _, static = sample._fields
+        if rank < self._settled.get(child, LOWEST) or rank < self._removed.get(child, LOWEST):
+            return True
+        latest = self._latest.get(child)
+        return static and latest is not None and rank < latest.rank
+
+    def _next_number(self) -> int:
+        self._number += 1
+        return self._number
+
+    def _outnumber(self, number: int, frames: Iterable[str]) -> None:
+        """Skip past a forged number of this bus, and say again what it may have masked."""
+        self._number = number
+        for frame in sorted(frames):
+            latest = self._latest.get(frame)
+            if latest is None or latest.origin != self.origin:
+                continue
+            again = Provenance(self.origin, self._next_number(), latest.outbox, latest.peer)
+            for outbox in self._outboxes:
+                sample = outbox.own_sample(frame)
+                if sample is not None:
+                    self._latest[frame] = again
+                    if sample.static:
+                        self._settled[frame] = again.rank
+                    outbox.add_batch(OutgoingBatch(again.origin, again.sequence, (sample,)))
+
+
+def relay_of(bus: Bus) -> Relay:
+    """The relay of a bus, which its links share; the bus itself holds it."""
+    if not isinstance(bus._relay, Relay):
+        bus._relay = Relay(bus, time_ns() // 1_000)
+    return bus._relay
+
+
+def _provenance_of(sample: TransformStamped) -> Provenance | None:
+    return sample._provenance if type(sample) is ReceivedTransform else None
+
+
+_Key = tuple[str, int, Row | None]
+
+
+class PassedSamples:
+    """Remembers the newest samples of each child that went over a bus, whichever way.
+
+    A sample is known by its child, parent, stamp and kind; a static one by its value as well, for many are stamped
+    zero. A moving one with another value is the same sample, as it is for tf2.
+
+    Parameters
+    ----------
+    per_child : int
+        How many samples of a child are remembered; then the oldest are forgotten.
+    gone_children : int
+        How many children that have left the bus are remembered.
+    """
+
+    def __init__(self, per_child: int = _PER_CHILD, gone_children: int = _GONE_CHILDREN) -> None:
+        self._per_child = per_child
+        self._gone_children = gone_children
+        self._keys: dict[str, dict[_Key, None]] = {}
+        self._gone: dict[str, None] = {}
+
+    def __contains__(self, sample: TransformStamped) -> bool:
+        parent, child, stamp, row, _, static = sample._fields
+        known = self._keys.get(child)
+        return known is not None and (parent, stamp, row if static else None) in known
+
+    def add(self, sample: TransformStamped) -> None:
+        """Remember a sample."""
+        parent, child, stamp, row, _, static = sample._fields
+        known = self._keys.get(child)
+        if known is None:
+            known = self._keys[child] = {}
+        elif child in self._gone:
+            del self._gone[child]
+        key = parent, stamp, row if static else None
+        # A sample that passes again is as new as any.
+        known.pop(key, None)
+        known[key] = None
+        if len(known) > self._per_child:
+            del known[next(iter(known))]
+
+    def forget(self, child: str) -> None:
+        """Forget all samples of a child."""
+        self._keys.pop(child, None)
+        self._gone.pop(child, None)
+
+    def retire(self, child: str) -> None:
+        """Remember a child that has left the bus only while few others leave: copies of its samples may be late."""
+        if child not in self._keys:
+            return
+        self._gone.pop(child, None)
+        self._gone[child] = None
+        if len(self._gone) > self._gone_children:
+            self.forget(next(iter(self._gone)))
+
+    def forget_moving(self) -> None:
+        """Forget all moving samples, because the clock has jumped back and their stamps may come once more."""
+        for child, known in list(self._keys.items()):
+            kept = {key: None for key in known if key[2] is not None}
+            if kept:
+                self._keys[child] = kept
+            else:
+                self.forget(child)

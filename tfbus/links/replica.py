@@ -1,0 +1,442 @@
+"""The domain is one replicated map, and each link holds a copy of it.
+
+The map
+-------
+Frame -> the *entry* of the highest rank: a sample, static or the newest moving one, or a removal. A rank is the number
+and the origin of the batch or removal (see `tfbus.links.relay`), so of two entries all links keep the same one, in
+whatever order they come: a last-writer-wins map (Shapiro, Preguica, Baquero and Zawirski, "Conflict-free replicated
+data types", 2011). Whoever holds an entry can give it on, not only its author. What a bus refuses is in its copy all
+the same.
+
+What goes over the wire
+-----------------------
+Live messages carry what is published and removed, as it happens. They are numbered, and nothing in them is repeated.
+What they did not bring is found and fetched by the messages below; kinds and layout are in `tfbus.links.message`.
+
+========  =========  ==========================================================================================
+message   to         says
+========  =========  ==========================================================================================
+live      a channel  batches and removals, with the number of the message
+sign      a channel  a sign of life: the number of the newest live message, the sequence and digest of the copy,
+                     and which buses are reached by other links
+meeting   one link   a sign, and what the sender itself brings to the domain, unless that is much
+question  one link   what has changed in your copy since this sequence? (and: these frames are all that I want)
+answer    one link   entries, the sequence up to which they tell all, and whether that is the newest
+========  =========  ==========================================================================================
+
+Each copy numbers its own changes: its *sequence* (as Syncthing does). An entry is *settled* once it has not changed for
+`SETTLING`; a static sample, a removal, and what an answer has told are settled at once. The digest is over settled
+entries, so a frame that moves many times a second does not make copies differ.
+
+1. A sign with the digest of one's own copy needs nothing: what that copy holds up to its sequence is here.
+2. Where digests differ, and the other sequence is beyond what is known of that copy, the link asks it a little later,
+   if they differ still. A missing number among the live messages is a reason to ask it soon, whatever the digests.
+3. There is one question at a time. Answers are bounded, and the next one is asked for behind the last, up to the
+   newest. Answers without news make the next question to that link wait twice as long.
+4. A link that starts asks the first one that it meets for all at once.
+
+So all copies agree some seconds after any trouble, without one digest for each peer and without a leader.
+
+Present, stale, lost
+--------------------
+*Present* is a link that the wire has announced. Its frames are *stale* if nothing new comes of them, which their ages
+tell; a process that is stopped or busy is no more than that. *Lost* is what the wire says is gone: on one machine the
+end of the socket, over a router the end of its token. Nothing leaves the map by that, for others may hear the process,
+or it may come back. A link with ``drop_lost`` takes the frames of a bus off its own bus while no way leads there, and
+puts them back, out of its copy, when one does. So both settings agree on the map, and each bus shows what it was told
+to show: without it the newest of all that was said, for late joiners too; with it only what somebody answers for.
+
+A way may lead over a bus with two links. Such a bus tells in its signs which buses it reaches by its other links, each
+with the buses on the way there, so that nobody takes a way that leads back through itself (a path vector, as in BGP,
+RFC 4271).
+"""
+
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Collection
+from math import inf
+from random import uniform
+from typing import NamedTuple
+
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links.hashes import hash_bytes
+from tfbus.links.outbox import OutgoingBatch, Rank, RemovedFrame
+
+SETTLING = 1.5
+"""s; a frame that moves less often than that is in the digests between its samples."""
+CHUNK = 500
+"""So many entries are told at once."""
+MOST_REMOVALS = 10_000
+"""So many removals are remembered, the newest."""
+MANY_ORIGINS = 20
+"""All buses together may have so many times the frames that one of them may have."""
+MOST_REMEMBERED = 1_000
+"""So many lost peers are remembered, with what was known of their copies."""
+PATIENCE = 3.0
+"""s; so long a link waits for an answer."""
+_LONGEST_PAUSE = 60.0
+_SPARE = 1_000
+_NEVER = -inf
+
+
+class Entry(NamedTuple):
+    """What a copy holds of one frame.
+
+    Attributes
+    ----------
+    number, origin
+        The rank.
+    sample : TransformStamped or None
+        None if the frame was removed.
+    ours : bool
+        Whether this link brings it to the domain: it came from the bus, and not by this link.
+    """
+
+    number: int
+    origin: bytes
+    sample: TransformStamped | None
+    ours: bool
+
+
+class Claim(NamedTuple):
+    """What a sign or an answer says of the sender's copy.
+
+    Attributes
+    ----------
+    since, sequence : int
+        An answer tells all changes behind `since` up to `sequence`.
+    digest : int
+        That of the copy at `sequence`; 0 if `final` is not set.
+    final : bool
+        Whether `sequence` is the newest.
+    partial : bool
+        Whether the sender's copy is of some frames only, so that it says nothing of others.
+    """
+
+    since: int
+    sequence: int
+    digest: int
+    final: bool = True
+    partial: bool = False
+
+
+class TooManyEntriesError(ValueError):
+    """A bus, or all together, has more frames than a copy holds."""
+
+
+class Replica:
+    """One copy of the map.
+
+    Parameters
+    ----------
+    max_frames : int
+        How many frames one origin may have, but for the own one.
+    own : bytes
+        The own origin.
+
+    Attributes
+    ----------
+    entries : dict of str to Entry
+    """
+
+    def __init__(self, max_frames: int, own: bytes) -> None:
+        self._max_frames = max_frames
+        self._own = own
+        self.entries: dict[str, Entry] = {}
+        self._held: Counter[bytes] = Counter()
+        self._removals: dict[str, None] = {}
+        # Frames whose entries have changed since they were numbered last, and whether they are to settle first.
+        self._fresh: dict[str, bool] = {}
+        self._unsettled: dict[str, float] = {}
+        self._sequences: dict[str, int] = {}
+        self._log: list[tuple[int, str]] = []
+        self._forgotten = 0
+        self._digests: dict[str, int] = {}
+        self._digest = 0
+        self._sequence = 0
+
+    def note(
+        self, frame: str, rank: Rank, sample: TransformStamped | None, *, ours: bool = False, settles: bool = False
+    ) -> bool:
+        """Take in an entry, if it is of a higher rank than the known one; returns whether it was.
+
+        Parameters
+        ----------
+        frame : str
+        rank : (int, bytes)
+        sample : TransformStamped or None
+            None for a removal.
+        ours : bool
+        settles : bool
+            Whether it may change again in a moment: a live sample of a moving frame.
+
+        Raises
+        ------
+        TooManyEntriesError
+            If its bus, or all together, has too many frames.
+        """
+        number, origin = rank
+        known = self.entries.get(frame)
+        if known is not None:
+            if number < known.number or (number == known.number and not self._replaces(origin, sample, known)):
+                return False
+            if known.sample is None:
+                self._removals.pop(frame, None)
+        if known is None or known.origin != origin or known.sample is None:
+            self._count(origin, known, sample)
+        self.entries[frame] = Entry(number, origin, sample, ours)
+        self._fresh[frame] = settles
+        if sample is None:
+            self._removals[frame] = None
+            if len(self._removals) > MOST_REMOVALS:
+                self._forget(next(iter(self._removals)))
+        return True
+
+    def claim(self, now: float, frames: Collection[str] | None = None) -> Claim:
+        """The sequence and the digest of the copy, or of the part of it that is about some frames."""
+        self._settle(now)
+        digest = self._digest
+        if frames is not None:
+            digest = 0
+            for frame in frames:
+                digest ^= self._digests.get(frame, 0)
+        return Claim(self._sequence, self._sequence, digest)
+
+    def changes(
+        self, since: int, now: float, frames: Collection[str] | None = None, limit: int = CHUNK
+    ) -> tuple[list[OutgoingBatch | RemovedFrame], Claim]:
+        """The oldest changes behind a sequence, and the claim that they are.
+
+        A sequence that is too old, or that the copy has not reached, gives the beginning of all that it holds: a claim
+        since 0. Entries that have not settled are among the changes.
+        """
+        self._settle(now)
+        for frame in self._unsettled:
+            # Numbered now to be told in order, and once more when it settles, for others do not hear this answer.
+            if frame not in self._sequences:
+                self._number(frame)
+        if since < self._forgotten or since > self._sequence:
+            since = 0
+        found: list[OutgoingBatch | RemovedFrame] = []
+        for place in range(bisect_right(self._log, since, key=_first), len(self._log)):
+            sequence, frame = self._log[place]
+            if self._sequences.get(frame) == sequence and (frames is None or frame in frames):
+                found.append(_told(frame, self.entries[frame]))
+                if len(found) == limit and sequence < self._sequence:
+                    return found, Claim(since, sequence, 0, final=False)
+        return found, self.claim(now, frames)._replace(since=since)
+
+    def ours(self, limit: int) -> list[OutgoingBatch | RemovedFrame] | None:
+        """All that this link brings to the domain; None if that is more than a limit."""
+        found: list[OutgoingBatch | RemovedFrame] = []
+        for frame, entry in self.entries.items():
+            if entry.ours and entry.sample is not None:
+                if len(found) == limit:
+                    return None
+                found.append(_told(frame, entry))
+        return found
+
+    def moving(self) -> list[str]:
+        """The moving frames that this link brings to the domain, sorted."""
+        return sorted(
+            frame
+            for frame, entry in self.entries.items()
+            if entry.ours and entry.sample is not None and not entry.sample.static
+        )
+
+    def _replaces(self, origin: bytes, sample: TransformStamped | None, known: Entry) -> bool:
+        if origin != known.origin:
+            return origin > known.origin
+        # Two samples of one batch.
+        return sample is not None and known.sample is not None and sample.stamp > known.sample.stamp
+
+    def _count(self, origin: bytes, known: Entry | None, sample: TransformStamped | None) -> None:
+        if sample is not None and origin != self._own:
+            held = self._held[origin]
+            if held >= self._max_frames or len(self.entries) >= MANY_ORIGINS * self._max_frames:
+                if not held:
+                    del self._held[origin]
+                raise TooManyEntriesError(f"the peer has announced more than {self._max_frames} frames")
+            self._held[origin] += 1
+        if known is not None and known.sample is not None and known.origin != self._own:
+            self._held[known.origin] -= 1
+            if not self._held[known.origin]:
+                del self._held[known.origin]
+
+    def _settle(self, now: float) -> None:
+        """Number the changes that have settled, and take those that have not out of the digest."""
+        for frame, settles in self._fresh.items():
+            self._digest ^= self._digests.pop(frame, 0)
+            self._sequences.pop(frame, None)
+            self._unsettled.pop(frame, None)
+            if settles:
+                self._unsettled[frame] = now
+            elif frame in self.entries:
+                self._number(frame, settled=True)
+        self._fresh.clear()
+        while self._unsettled:
+            frame = next(iter(self._unsettled))
+            if now - self._unsettled[frame] < SETTLING:
+                break
+            del self._unsettled[frame]
+            self._number(frame, settled=True)
+
+    def _number(self, frame: str, settled: bool = False) -> None:
+        self._sequence += 1
+        self._sequences[frame] = self._sequence
+        self._log.append((self._sequence, frame))
+        if len(self._log) > 2 * len(self.entries) + _SPARE:
+            self._log = [(number, frame) for number, frame in self._log if self._sequences.get(frame) == number]
+        number, origin, sample, _ = self.entries[frame]
+        if settled and sample is not None:
+            digest = int.from_bytes(hash_bytes(b"%b%d %b" % (origin, number, frame.encode()), 8), "little")
+            self._digest ^= digest
+            self._digests[frame] = digest
+
+    def _forget(self, frame: str) -> None:
+        """Forget a removal; who asks for the changes behind it gets all that there is."""
+        del self._removals[frame], self.entries[frame]
+        self._fresh.pop(frame, None)
+        self._forgotten = max(self._forgotten, self._sequences.pop(frame, 0))
+
+
+def _first(logged: tuple[int, str]) -> int:
+    return logged[0]
+
+
+def _told(frame: str, entry: Entry) -> OutgoingBatch | RemovedFrame:
+    if entry.sample is None:
+        return RemovedFrame(entry.origin, entry.number, frame)
+    return OutgoingBatch(entry.origin, entry.number, (entry.sample,))
+
+
+class _Copy:
+    """What is known of the copy of one peer."""
+
+    __slots__ = ("claim", "due", "fruitless", "missed", "replica", "seen")
+
+    def __init__(self, replica: Replica, seen: int) -> None:
+        self.replica = replica
+        # All changes up to this sequence are here.
+        self.seen = seen
+        self.claim: Claim | None = None
+        self.due = inf
+        self.missed = False
+        self.fruitless = 0
+
+
+class Question(NamedTuple):
+    """A question that is due: what has changed in the copy of a peer since a sequence."""
+
+    peer: str
+    since: int
+
+
+class Agreement:
+    """Decides whom a link asks for what, so that its copies come to agree with those of its peers; see above.
+
+    Nothing here knows an event loop: the caller hands in each time, in s of a monotonic clock.
+    """
+
+    def __init__(self) -> None:
+        self._copies: dict[str, _Copy] = {}
+        self._remembered: dict[str, int] = {}
+        self._asked: Question | None = None
+        self._patience = _NEVER
+        self._is_new = True
+
+    def joined(self, peer: str, replica: Replica, now: float, must_ask: bool = False) -> None:
+        """Begin to follow the copy of a peer; it has to be asked if this is the first one, or if the caller says so."""
+        self._copies[peer] = copy = _Copy(replica, self._remembered.pop(peer, 0))
+        if self._is_new or must_ask:
+            self._is_new = False
+            copy.due, copy.missed = now, True
+
+    def left(self, peer: str) -> None:
+        """Follow the copy of a peer no more."""
+        copy = self._copies.pop(peer, None)
+        if copy is not None and copy.seen:
+            self._remembered[peer] = copy.seen
+            if len(self._remembered) > MOST_REMEMBERED:
+                del self._remembered[next(iter(self._remembered))]
+        if self._asked is not None and self._asked.peer == peer:
+            self._asked = None
+            self._is_new = self._is_new or not any(other.seen for other in self._copies.values())
+
+    def told(self, peer: str, claim: Claim, now: float, soon: bool = False) -> None:
+        """A sign of a peer says what its copy is; with `soon`, what is missing is to be asked for at once."""
+        copy = self._copies.get(peer)
+        if copy is None or claim.partial or (copy.claim is not None and claim.sequence < copy.claim.sequence):
+            return
+        copy.claim = claim
+        if not copy.missed and self._agrees(copy, now):
+            copy.seen, copy.due, copy.fruitless = claim.sequence, inf, 0
+        elif claim.sequence > copy.seen:
+            pause = 0.0 if soon else min(uniform(0.3, 0.7) * 2**copy.fruitless, _LONGEST_PAUSE)
+            copy.due = min(copy.due, now + pause)
+
+    def missed(self, peer: str, now: float) -> None:
+        """Live messages of a peer did not come."""
+        copy = self._copies.get(peer)
+        if copy is not None:
+            copy.missed = True
+            copy.due = min(copy.due, now + uniform(0.05, 0.2))
+
+    def answered(self, peer: str, claim: Claim, news: bool, now: float) -> None:
+        """An answer of a peer, whose entries were noted, has told what a claim says."""
+        copy, asked = self._copies.get(peer), self._asked
+        if copy is None or asked is None or asked.peer != peer or claim.since not in (0, asked.since):
+            return
+        self._asked = None
+        if not claim.final and claim.sequence <= (copy.seen if claim.since else 0):
+            # An answer that leads nowhere.
+            self._fail(copy, now)
+            return
+        copy.seen = claim.sequence
+        copy.due = now
+        if claim.final:
+            copy.due, copy.missed, copy.claim = inf, False, claim
+            copy.fruitless = 0 if news or self._agrees(copy, now) else min(copy.fruitless + 1, 10)
+
+    def unanswered(self, peer: str, now: float) -> None:
+        """A peer has not answered."""
+        copy = self._copies.get(peer)
+        if self._asked is not None and self._asked.peer == peer:
+            self._asked = None
+            if copy is not None:
+                self._fail(copy, now)
+
+    def question(self, now: float) -> Question | None:
+        """The question to ask now; None if there is none, or an answer is awaited."""
+        if self._asked is not None:
+            if now < self._patience:
+                return None
+            self.unanswered(self._asked.peer, now)
+        while True:
+            peer = min(self._copies, key=self._due_of, default=None)
+            if peer is None or self._copies[peer].due > now:
+                return None
+            copy = self._copies[peer]
+            copy.due = inf
+            if copy.missed or not self._agrees(copy, now):
+                self._asked, self._patience = Question(peer, copy.seen), now + PATIENCE
+                return self._asked
+            copy.seen = max(copy.seen, 0 if copy.claim is None else copy.claim.sequence)
+
+    def next_due(self) -> float:
+        """The time at which `question` has to be called next."""
+        if self._asked is not None:
+            return self._patience
+        return min((copy.due for copy in self._copies.values()), default=inf)
+
+    def _agrees(self, copy: _Copy, now: float) -> bool:
+        return copy.claim is not None and copy.claim.digest == copy.replica.claim(now).digest
+
+    def _fail(self, copy: _Copy, now: float) -> None:
+        copy.fruitless = min(copy.fruitless + 1, 10)
+        copy.missed = True
+        copy.due = now + min(uniform(0.3, 0.7) * 2**copy.fruitless, _LONGEST_PAUSE)
+
+    def _due_of(self, peer: str) -> float:
+        return self._copies[peer].due
+
