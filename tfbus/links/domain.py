@@ -1,6 +1,6 @@
 """The end of a link of tfbus, between the relay of its bus and a wire; `tfbus.links.replica` tells the protocol."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from fnmatch import fnmatchcase
 from math import inf
@@ -31,7 +31,7 @@ from tfbus.links.message import (
 from tfbus.links.outbox import Outbox, OutgoingBatch, RemovedFrame, Turn
 from tfbus.links.peers import Peer
 from tfbus.links.relay import Provenance, ReceivedBatch, ReceivedTransform
-from tfbus.links.replica import CHUNK, Agreement, Claim, Replica, TooManyEntriesError
+from tfbus.links.replica import CHUNK, Agreement, Claim, Entry, Replica, TooManyEntriesError
 from tfbus.links.wire import Hearing, Joined, Left, Wire, WireItem
 from tfbus.tf_message import MalformedMessageError
 
@@ -72,16 +72,19 @@ class DomainOutbox(Outbox):
     def reach_changed(self) -> None:
         self._end.sign_soon()
 
+    def keep(self, batch: OutgoingBatch) -> None:
+        own, rank = self._end.own, (batch.sequence, batch.origin)
+        for sample in batch.samples:
+            _, child, _, _, _, static = sample._fields
+            if (self._frames is None or child in self._frames) and can_hold(sample):
+                try:
+                    own.note(child, rank, sample, ours=True, settles=not static)
+                except TooManyEntriesError:
+                    continue
+
     def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
         if not echo:
-            own, rank = self._end.own, (batch.sequence, batch.origin)
-            for sample in batch.samples:
-                if can_hold(sample):
-                    _, child, _, _, _, static = sample._fields
-                    try:
-                        own.note(child, rank, sample, ours=True, settles=not static)
-                    except TooManyEntriesError:
-                        continue
+            self.keep(batch)
         return False
 
     def _follow_removal(self, removal: RemovedFrame, echo: bool, withdrawn: bool) -> bool:
@@ -107,6 +110,8 @@ class DomainEnd(Endpoint):
         How often the newest samples go to those that hear less than all, in Hz.
     history : float or None
         How many seconds of the past each new peer is asked for.
+    now : callable
+        Returns a monotonic time in s.
 
     Attributes
     ----------
@@ -128,8 +133,10 @@ class DomainEnd(Endpoint):
         robots: dict[str, float] | None = None,
         slow_rate: float = 1.0,
         history: float | None = None,
+        now: Callable[[], float] = monotonic,
     ) -> None:
         super().__init__(bus, name, frames, drop_lost, max_frames)
+        self._now = now
         self.id = wire.id
         self._wire = wire
         self._robot = robot
@@ -145,7 +152,7 @@ class DomainEnd(Endpoint):
         self.own = self._replica_of(robot)
         self._agreement = Agreement()
         self._history_teller = HistoryTeller(bus, self.relay, self.own)
-        self._history = None if history is None else HistoryAsker(history, self._ask_past, monotonic)
+        self._history = None if history is None else HistoryAsker(history, self._ask_past, now)
         self.lookups = RemoteLookups(wire.send, wire.id, name)
         self._news: dict[str, bool] = {}
         self._thinned: dict[str, float] = {}
@@ -156,7 +163,7 @@ class DomainEnd(Endpoint):
     # For the link
 
     async def open(self) -> None:
-        await self._wire.open(self._hearings(), self._receive, self.report.failed)
+        await self._wire.open(self._hearings(), self.take, self.report.failed)
 
     async def run(self) -> None:
         await self._wire.run()
@@ -175,7 +182,7 @@ class DomainEnd(Endpoint):
         self.relay.detach(self.outbox)
 
     def work(self) -> float:
-        now = monotonic()
+        now = self._now()
         question = self._agreement.question(now)
         if question is not None:
             frames = sorted(self.frames) if self.frames is not None and self._filters else None
@@ -223,7 +230,7 @@ class DomainEnd(Endpoint):
     # Going out
 
     def _send(self, turn: Turn) -> None:
-        self._channels.send(turn, monotonic())
+        self._channels.send(turn, self._now())
         self._sign_sooner()
 
     def _sign_sooner(self) -> None:
@@ -244,7 +251,7 @@ class DomainEnd(Endpoint):
     def _meet(self, peer: Peer) -> None:
         """Tell a new peer what this link brings, or that it is much."""
         self.send()
-        claim = self.own.claim(monotonic())._replace(partial=self.frames is not None)
+        claim = self.own.claim(self._now())._replace(partial=self.frames is not None)
         out = Outgoing(Kind.MEETING, self.relay.origin, 0, claim, self.outbox.time, self._reach(), self._serves)
         entries: Sequence[OutgoingBatch | RemovedFrame] = self.own.ours(CHUNK) or ()
         try:
@@ -255,7 +262,7 @@ class DomainEnd(Endpoint):
 
     # Coming in
 
-    def _receive(self, link: str, item: WireItem) -> None:
+    def take(self, link: str, item: WireItem) -> None:
         """Take an item of the wire, from any thread."""
         if isinstance(item, bytes):
             kind = kind_of(item)
@@ -272,7 +279,7 @@ class DomainEnd(Endpoint):
             peer = self._join(sender, content.robot)
             if peer is not None:
                 # A peer hears of a filter by the first question.
-                self._agreement.joined(sender, self._replica_of(peer.robot), monotonic(), must_ask=self._filters)
+                self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
                 self._meet(peer)
                 self._sign_sooner()
                 if self._history is not None:
@@ -316,7 +323,7 @@ class DomainEnd(Endpoint):
         self._take_held(peer, heard)
 
     def _take_held(self, peer: Peer, heard: Heard) -> None:
-        now = monotonic()
+        now = self._now()
         live = heard.kind is Kind.LIVE
         if not heard.continues and (live or heard.kind is Kind.SIGN) and self._count_gap(peer, heard.number, live):
             self._agreement.missed(peer.id, now)
@@ -385,7 +392,8 @@ class DomainEnd(Endpoint):
                 assert peer is not None
                 self.peers.reject(peer.id, "too many frames", error)
                 continue
-            if live or is_new:
+            # Of a moving frame, every live sample counts; the relay knows which of them have come before.
+            if is_new or (live and not static and _moves(replica.entries[child])):
                 kept.append(sample)
         return kept
 
@@ -415,6 +423,9 @@ class DomainEnd(Endpoint):
             # The newest sample of a moving frame would make its past no news.
             batches = [(source, [sample for sample in samples if sample.static]) for source, samples in batches]
         if self.drop_lost:
+            for source, samples in batches:
+                if not self.relay.reaches(source.origin):
+                    self.relay.mask(source, samples)
             batches = [(source, samples) for source, samples in batches if self.relay.reaches(source.origin)]
         offered = sum(len(samples) for _, samples in batches)
         if not offered:
@@ -453,7 +464,7 @@ class DomainEnd(Endpoint):
         rate = self._rate_of(peer.robot)
         if heard.number or rate == inf:
             return False
-        now = monotonic()
+        now = self._now()
         since = now - self._thinned.get(peer.id, -inf)
         # Samples that belong together come in several messages at once.
         if since > 0.02:
@@ -528,12 +539,12 @@ class DomainEnd(Endpoint):
             if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
                 raise MalformedMessageError("text", "a filter without names")
             frames = frozenset(names)
-            if not self._channels.serve(frames, monotonic()):
+            if not self._channels.serve(frames, self._now()):
                 error = ValueError("too many different filters to serve")
                 self.peers.reject(sender, "too many filters", error)
         limit = CHUNK
         while limit:
-            entries, claim = self.own.changes(since, monotonic(), frames, limit)
+            entries, claim = self.own.changes(since, self._now(), frames, limit)
             claim = claim._replace(partial=self.frames is not None)
             out = Outgoing(Kind.ANSWER, self.relay.origin, 0, claim, None, self._reach())
             try:
@@ -601,3 +612,7 @@ class DomainEnd(Endpoint):
 
     def _rate_of(self, robot: str) -> float:
         return next((rate for robots, rate in self._robots.items() if fnmatchcase(robot, robots)), inf)
+
+
+def _moves(entry: Entry) -> bool:
+    return entry.sample is not None and not entry.sample.static

@@ -128,6 +128,9 @@ class Outbox:
     keeps_withdrawn = False
     """Whether the other ends see for themselves that the owner of a frame was lost."""
 
+    def keep(self, batch: OutgoingBatch) -> None:
+        """Note samples of a lost bus, which are not on this bus, for whoever shows them."""
+
     def own_sample(self, frame: str) -> TransformStamped | None:
         """The newest sample of a frame that this link has to say again if somebody has outnumbered it."""
         return None

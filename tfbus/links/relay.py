@@ -20,7 +20,7 @@ way leads to any more. They are not removed: see `tfbus.links.replica`.
 
 import os
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from itertools import groupby
 from time import time_ns
 from typing import Any
@@ -269,6 +269,25 @@ class Relay:
                     self._remove_from_bus(frame, Provenance(self.origin, self._next_number(), outbox, peer))
         return frames
 
+    def say_again(self, frames: Iterable[str]) -> None:
+        """Give those of some frames that are this bus's own new numbers, by which they are news to all others."""
+        own = [frame for frame in sorted(frames) if frame in self._latest and self._latest[frame].origin == self.origin]
+        if not own:
+            return
+        latched: dict[str, TransformStamped] = {}
+        self._bus.subscribe(lambda batch: latched.update((sample.child, sample) for sample in batch)).close()
+        for frame in own:
+            kept = (latched.get(frame), *(outbox.own_sample(frame) for outbox in self._outboxes))
+            sample = next((sample for sample in kept if sample is not None), None)
+            if sample is not None:
+                latest = self._latest[frame]
+                again = Provenance(self.origin, self._next_number(), latest.outbox, latest.peer)
+                self._latest[frame] = again
+                if sample.static:
+                    self._settled[frame] = again.rank
+                for outbox in self._outboxes:
+                    outbox.add_batch(OutgoingBatch(again.origin, again.sequence, (sample,)))
+
     # Reach
 
     def reaches(self, origin: bytes) -> bool:
@@ -315,6 +334,19 @@ class Relay:
                 latest = self._latest.get(frame)
                 if latest is None or latest.origin != origin:
                     self._release(origin, frame)
+
+    def mask(self, provenance: Provenance, samples: Sequence[TransformStamped]) -> None:
+        """Withdraw frames of which a lost bus was the last to speak, but say again which of them are this bus's own."""
+        self._number = max(self._number, provenance.sequence)
+        for outbox in self._outboxes:
+            if outbox is not provenance.outbox:
+                outbox.keep(OutgoingBatch(provenance.origin, provenance.sequence, samples))
+        frames = sorted({sample.child for sample in samples})
+        self.say_again(frames)
+        for frame in frames:
+            latest = self._latest.get(frame)
+            if not self._bus.closed and latest is not None and latest.rank < provenance.rank:
+                self._remove_from_bus(frame, None)
 
     def withdraw(self, frames: Iterable[str], origins: Collection[bytes]) -> None:
         """Take frames off this bus whose newest sample is of some buses; nothing is said of them to others."""
@@ -377,15 +409,11 @@ class Relay:
         return refused
 
     def _remove_from_bus(self, frame: str, provenance: Provenance | None) -> None:
-        if frame not in self._latest:
-            # None of its samples was passed on, so no link has to be told.
-            self._forget_frame(frame, provenance)
-            return
         self._removing = frame, provenance
         try:
             self._bus.remove_frame(frame)
         except UnknownFrameError:
-            # The bus forgot it when its clock jumped back, but other buses did not.
+            # It was never on this bus, or the bus forgot it when its clock jumped back, but others have it.
             self._on_removal(frame)
         finally:
             self._removing = None
@@ -432,7 +460,8 @@ class Relay:
         if provenance is not None:
             removal = RemovedFrame(provenance.origin, provenance.sequence, frame)
             for outbox in self._outboxes:
-                outbox.add_removal(removal, echo=outbox is provenance.outbox)
+                if latest is not None or outbox.keeps_withdrawn:
+                    outbox.add_removal(removal, echo=outbox is provenance.outbox)
         elif latest is not None:
             withdrawal = RemovedFrame(latest.origin, latest.sequence, frame)
             for outbox in self._outboxes:
@@ -474,18 +503,7 @@ class Relay:
     def _outnumber(self, number: int, frames: Iterable[str]) -> None:
         """Skip past a forged number of this bus, and say again what it may have masked."""
         self._number = number
-        for frame in sorted(frames):
-            latest = self._latest.get(frame)
-            if latest is None or latest.origin != self.origin:
-                continue
-            again = Provenance(self.origin, self._next_number(), latest.outbox, latest.peer)
-            for outbox in self._outboxes:
-                sample = outbox.own_sample(frame)
-                if sample is not None:
-                    self._latest[frame] = again
-                    if sample.static:
-                        self._settled[frame] = again.rank
-                    outbox.add_batch(OutgoingBatch(again.origin, again.sequence, (sample,)))
+        self.say_again(frames)
 
 
 def relay_of(bus: Bus) -> Relay:

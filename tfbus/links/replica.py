@@ -51,6 +51,7 @@ with the buses on the way there, so that nobody takes a way that leads back thro
 RFC 4271).
 """
 
+import heapq
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Collection
@@ -67,7 +68,7 @@ SETTLING = 1.5
 CHUNK = 500
 """So many entries are told at once."""
 MOST_REMOVALS = 10_000
-"""So many removals are remembered, the newest."""
+"""So many removals are remembered, those of the highest ranks."""
 MANY_ORIGINS = 20
 """All buses together may have so many times the frames that one of them may have."""
 MOST_REMEMBERED = 1_000
@@ -144,13 +145,14 @@ class Replica:
         self._own = own
         self.entries: dict[str, Entry] = {}
         self._held: Counter[bytes] = Counter()
-        self._removals: dict[str, None] = {}
+        # A heap of the removals, the lowest ranks first; what was said of a frame since leaves its removal there.
+        self._removals: list[tuple[Rank, str]] = []
+        self._removed = 0
         # Frames whose entries have changed since they were numbered last, and whether they are to settle first.
         self._fresh: dict[str, bool] = {}
         self._unsettled: dict[str, float] = {}
         self._sequences: dict[str, int] = {}
         self._log: list[tuple[int, str]] = []
-        self._forgotten = 0
         self._digests: dict[str, int] = {}
         self._digest = 0
         self._sequence = 0
@@ -180,16 +182,16 @@ class Replica:
         if known is not None:
             if number < known.number or (number == known.number and not self._replaces(origin, sample, known)):
                 return False
-            if known.sample is None:
-                self._removals.pop(frame, None)
+            self._removed -= known.sample is None
         if known is None or known.origin != origin or known.sample is None:
             self._count(origin, known, sample)
         self.entries[frame] = Entry(number, origin, sample, ours)
         self._fresh[frame] = settles
         if sample is None:
-            self._removals[frame] = None
-            if len(self._removals) > MOST_REMOVALS:
-                self._forget(next(iter(self._removals)))
+            self._removed += 1
+            heapq.heappush(self._removals, (rank, frame))
+            if self._removed > MOST_REMOVALS or len(self._removals) > 2 * MOST_REMOVALS:
+                self._forget_removals()
         return True
 
     def claim(self, now: float, frames: Collection[str] | None = None) -> Claim:
@@ -207,15 +209,15 @@ class Replica:
     ) -> tuple[list[OutgoingBatch | RemovedFrame], Claim]:
         """The oldest changes behind a sequence, and the claim that they are.
 
-        A sequence that is too old, or that the copy has not reached, gives the beginning of all that it holds: a claim
-        since 0. Entries that have not settled are among the changes.
+        A sequence that the copy has not reached gives the beginning of all that it holds: a claim since 0. Entries that
+        have not settled are among the changes.
         """
         self._settle(now)
         for frame in self._unsettled:
             # Numbered now to be told in order, and once more when it settles, for others do not hear this answer.
             if frame not in self._sequences:
                 self._number(frame)
-        if since < self._forgotten or since > self._sequence:
+        if since > self._sequence:
             since = 0
         found: list[OutgoingBatch | RemovedFrame] = []
         for place in range(bisect_right(self._log, since, key=_first), len(self._log)):
@@ -288,16 +290,27 @@ class Replica:
         if len(self._log) > 2 * len(self.entries) + _SPARE:
             self._log = [(number, frame) for number, frame in self._log if self._sequences.get(frame) == number]
         number, origin, sample, _ = self.entries[frame]
-        if settled and sample is not None:
-            digest = int.from_bytes(hash_bytes(b"%b%d %b" % (origin, number, frame.encode()), 8), "little")
+        if settled:
+            rank = b"%b%d %d " % (origin, number, sample is None)
+            digest = int.from_bytes(hash_bytes(rank + frame.encode("utf-8", "surrogatepass"), 8), "little")
             self._digest ^= digest
             self._digests[frame] = digest
 
-    def _forget(self, frame: str) -> None:
-        """Forget a removal; who asks for the changes behind it gets all that there is."""
-        del self._removals[frame], self.entries[frame]
-        self._fresh.pop(frame, None)
-        self._forgotten = max(self._forgotten, self._sequences.pop(frame, 0))
+    def _forget_removals(self) -> None:
+        """Forget removals beyond the bound: those of the lowest ranks, so that all copies forget the same ones."""
+        while self._removed > MOST_REMOVALS:
+            rank, frame = heapq.heappop(self._removals)
+            entry = self.entries.get(frame)
+            if entry is not None and entry.sample is None and (entry.number, entry.origin) == rank:
+                self._removed -= 1
+                del self.entries[frame]
+                self._fresh.pop(frame, None)
+                self._sequences.pop(frame, None)
+                self._digest ^= self._digests.pop(frame, 0)
+        if len(self._removals) > 2 * MOST_REMOVALS:
+            entries = self.entries.items()
+            self._removals = [((entry.number, entry.origin), frame) for frame, entry in entries if entry.sample is None]
+            heapq.heapify(self._removals)
 
 
 def _first(logged: tuple[int, str]) -> int:
@@ -313,7 +326,7 @@ def _told(frame: str, entry: Entry) -> OutgoingBatch | RemovedFrame:
 class _Copy:
     """What is known of the copy of one peer."""
 
-    __slots__ = ("claim", "due", "fruitless", "missed", "replica", "seen")
+    __slots__ = ("claim", "due", "fruitless", "missed", "replica", "seen", "silences")
 
     def __init__(self, replica: Replica, seen: int) -> None:
         self.replica = replica
@@ -322,7 +335,9 @@ class _Copy:
         self.claim: Claim | None = None
         self.due = inf
         self.missed = False
+        # Answers without news, and questions without an answer, one after the other.
         self.fruitless = 0
+        self.silences = 0
 
 
 class Question(NamedTuple):
@@ -369,6 +384,10 @@ class Agreement:
         if copy is None or claim.partial or (copy.claim is not None and claim.sequence < copy.claim.sequence):
             return
         copy.claim = claim
+        if copy.silences:
+            # It was stopped or cut off, and speaks again.
+            copy.silences = 0
+            copy.due = min(copy.due, now + uniform(0.05, 0.2))
         if not copy.missed and self._agrees(copy, now):
             copy.seen, copy.due, copy.fruitless = claim.sequence, inf, 0
         elif claim.sequence > copy.seen:
@@ -395,7 +414,7 @@ class Agreement:
         copy.seen = claim.sequence
         copy.due = now
         if claim.final:
-            copy.due, copy.missed, copy.claim = inf, False, claim
+            copy.due, copy.missed, copy.claim, copy.silences = inf, False, claim, 0
             copy.fruitless = 0 if news or self._agrees(copy, now) else min(copy.fruitless + 1, 10)
 
     def unanswered(self, peer: str, now: float) -> None:
@@ -433,9 +452,9 @@ class Agreement:
         return copy.claim is not None and copy.claim.digest == copy.replica.claim(now).digest
 
     def _fail(self, copy: _Copy, now: float) -> None:
-        copy.fruitless = min(copy.fruitless + 1, 10)
+        copy.silences = min(copy.silences + 1, 10)
         copy.missed = True
-        copy.due = now + min(uniform(0.3, 0.7) * 2**copy.fruitless, _LONGEST_PAUSE)
+        copy.due = now + min(uniform(0.3, 0.7) * 2**copy.silences, _LONGEST_PAUSE)
 
     def _due_of(self, peer: str) -> float:
         return self._copies[peer].due
