@@ -17,6 +17,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.asking import Asked, settle
+from support.processes import is_open
 from support.recorded import SMALL, WRONG_IN_SMALL, batches_in, write_mcap
 from support.samples import moving, static
 from trio.testing import MockClock
@@ -76,19 +77,18 @@ def x_at(buffer: Buffer, seconds: float) -> float:
 
 
 @contextmanager
-def reads_of(path: Path) -> Iterator[set[int]]:
-    """The threads that open a file."""
-    readers: set[int] = set()
+def before_opening(path: Path, call: Callable[[], object]) -> Iterator[None]:
+    """Call a function in each thread that is about to open a file."""
     listening = [True]
 
     def hear(event: str, arguments: tuple[object, ...]) -> None:
         if listening and event == "open" and arguments[0] in (path, str(path)):
-            readers.add(threading.get_ident())
+            call()
 
-    # It cannot be taken away again.
+    # No interface removes an audit hook.
     sys.addaudithook(hear)
     try:
-        yield readers
+        yield
     finally:
         listening.clear()
 
@@ -541,7 +541,8 @@ def test_at_the_lowest_rates_a_simulated_clock_still_advances(tmp_path: Path) ->
 async def test_the_event_loop_does_not_read_the_file(tmp_path: Path, finish: bool) -> None:
     lines = [(received, "/tf", batch) for received, batch in drive((0.0, 0.5))]
     path = write_mcap(tmp_path / "run.mcap", lines, finish=finish)
-    with Bus(SimulatedClock()) as bus, reads_of(path) as readers:
+    readers: set[int] = set()
+    with Bus(SimulatedClock()) as bus, before_opening(path, lambda: readers.add(threading.get_ident())):
         await Player(bus, path, rate=AS_FAST_AS_POSSIBLE).play()
     assert readers
     assert threading.get_ident() not in readers
@@ -631,6 +632,33 @@ def test_play_can_be_cancelled_under_plain_asyncio(tmp_path: Path) -> None:
             with pytest.raises(TimeoutError):
                 async with asyncio.timeout(0.01):
                     await player.play()
+
+    asyncio.run(main())
+
+
+def test_a_file_that_a_thread_opens_while_plain_asyncio_cancels_play_is_closed(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive((0.0,)))
+    go_on = threading.Event()
+
+    async def main() -> None:
+        loop, opening = asyncio.get_running_loop(), asyncio.Event()
+
+        def hold_the_thread() -> None:
+            loop.call_soon_threadsafe(opening.set)
+            go_on.wait(PATIENCE)
+
+        with Bus() as bus, before_opening(path, hold_the_thread):
+            task = asyncio.create_task(Player(bus, path).play())
+            await opening.wait()
+            task.cancel()
+            for _ in range(10):
+                await asyncio.sleep(0)
+            ended_early = task.done()
+            go_on.set()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            assert not ended_early
+            assert not is_open(path)
 
     asyncio.run(main())
 
