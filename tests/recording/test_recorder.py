@@ -222,6 +222,20 @@ async def test_a_few_samples_are_written_soon_without_a_flush(bus: Bus, path: Pa
             await until(lambda number=number: recorder.statistics().samples == number)  # type: ignore[misc]
 
 
+async def test_a_chunk_ends_every_half_second_and_not_with_each_write(bus: Bus, path: Path) -> None:
+    begin = anyio.current_time()
+    async with Recorder(bus, path):
+        for number in range(40):
+            bus.publish(moving("map", "a", number))
+            await anyio.sleep(0.01)
+    elapsed = anyio.current_time() - begin
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    # The first write ends one, and so does the end; there is a write every 50 ms.
+    assert len(summary.chunk_indexes) <= 2 + elapsed / 0.5
+
+
 async def test_each_time_that_dropping_begins_there_is_one_event(path: Path) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         # Also if something is pending from the beginning on.

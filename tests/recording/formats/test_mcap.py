@@ -262,6 +262,18 @@ def test_damage_in_the_index_loses_no_messages(write: Write) -> None:
             assert recording.count is None
 
 
+def test_an_index_is_used_up_to_its_bound(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(LINES)
+    data = path.read_bytes()
+    begin, _, _ = struct.unpack("<QQI", data[-28:-8])
+    size = len(data) - begin
+    for bound, count in ((size, COUNT + 1), (size - 1, None)):
+        monkeypatch.setattr("tfbus.recording.formats.mcap.MAX_INDEX", bound)
+        with open_recording(path) as recording:
+            assert recording.count == count
+        assert batches_in(path) == EXPECTED
+
+
 def test_an_index_entry_that_leads_to_another_record_loses_only_its_chunk(write: Write) -> None:
     path = write(LINES, enable_crcs=False)
     data = bytearray(path.read_bytes())
