@@ -96,8 +96,9 @@ def before_opening(path: Path, call: Callable[[], object]) -> Iterator[None]:
 class Listener:
     """Collects the batches of a bus, with the clock's time."""
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: Bus, patience: float = PATIENCE) -> None:
         self.entries: list[TimedBatch] = []
+        self._patience = patience
         self._bus = bus
         self._registration = bus.subscribe(self._hear)
         self.arrived = anyio.Event()
@@ -111,7 +112,7 @@ class Listener:
         return [batch for _, batch in self.entries]
 
     async def until(self, count: int) -> None:
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(self._patience):
             while len(self.entries) < count:
                 self.arrived = anyio.Event()
                 await self.arrived.wait()
@@ -328,9 +329,6 @@ async def test_a_seek_interrupts_a_pause_of_an_hour(tmp_path: Path, simulated: b
             player.seek(START)
             await heard.until(6)
             player.seek(START + 7_200 * SECOND)
-            with anyio.fail_after(PATIENCE):
-                while not playing.ended:  # noqa: ASYNC110
-                    await anyio.sleep(0.001)
         if simulated:
             assert [now for now, _ in heard.entries] == [
                 START + hours * 3_600 * SECOND for hours in (0, 0, 1, 1, 0, 0, 2, 2)
@@ -376,31 +374,49 @@ async def test_a_loop_ends_where_there_is_nothing_to_play(tmp_path: Path) -> Non
     assert (player.played, player.passes, player.position) == (0, 2, None)
 
 
-def in_virtual_time(function: Callable[[], Awaitable[None]]) -> None:
-    """Run with trio's own clock, which jumps to the next deadline whenever nothing runs."""
-    clock = MockClock(autojump_threshold=0)
-    anyio.run(function, backend="trio", backend_options={"clock": clock})
-
-
-@pytest.mark.parametrize("rate", [1.0, 2.0, 0.25])
-@pytest.mark.parametrize(
-    ("simulated", "times"),
-    [(True, (0.0, 0.5, 0.501, 9.0)), (False, (0.0, 0.5, 0.501, 86_400.0))],
-    ids=["simulated", "system"],
-)
-def test_each_message_is_published_at_its_time(
-    tmp_path: Path, rate: float, simulated: bool, times: tuple[float, ...]
-) -> None:
-    path = write_recording(tmp_path / "run.mcap", *drive(times))
+def times_in(
+    path: Path,
+    steer: Callable[[Player, Listener], Awaitable[None]] | None = None,
+    *,
+    simulated: bool = True,
+    **options: Any,
+) -> list[float]:
+    """The times at which messages are heard, in s since the call of `play`; `steer` commands the player meanwhile."""
+    times: list[float] = []
 
     async def play() -> None:
-        with Bus(SimulatedClock() if simulated else None) as bus:
-            bus.subscribe(lambda _: heard.append(anyio.current_time()))
-            await Player(bus, path, rate=rate).play()
+        # The clock of the loop is not at zero at the beginning.
+        await anyio.sleep(1_000.0)
+        begin = anyio.current_time()
+        with Bus(SimulatedClock(START) if simulated else None) as bus:
+            # Without a limit: the clock of the loop jumps to it while a thread reads.
+            heard, player = Listener(bus, math.inf), Player(bus, path, **options)
+            bus.subscribe(lambda _: times.append(anyio.current_time() - begin))
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(player.play)
+                if steer is not None:
+                    await steer(player, heard)
 
-    heard: list[float] = []
-    in_virtual_time(play)
-    assert [time - heard[0] for time in heard] == pytest.approx([time / rate for time in times], abs=1e-6)
+    # trio's own clock jumps to the next deadline whenever nothing runs.
+    anyio.run(play, backend="trio", backend_options={"clock": MockClock(autojump_threshold=0)})
+    return times
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+@pytest.mark.parametrize(
+    ("rate", "times"),
+    [
+        *((rate, (0.0, 0.5, 0.501, 9.0)) for rate in (1.0, 2.0, 0.25)),
+        (1e-9, (0.0, 3e-9)),
+        *((rate, (0.0, 1.0, 1_000_000.0)) for rate in (1e12, 1e300, AS_FAST_AS_POSSIBLE)),
+    ],
+)
+def test_each_message_is_published_at_its_time(
+    tmp_path: Path, simulated: bool, rate: float, times: tuple[float, ...]
+) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive(times))
+    expected = [time / rate for time in times]
+    assert times_in(path, simulated=simulated, rate=rate) == pytest.approx(expected, abs=2e-6)
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -408,133 +424,86 @@ def test_each_message_is_published_at_its_time(
 def test_a_pause_and_a_new_rate_count_from_their_moment(
     tmp_path: Path, simulated: bool, rate: float | None, left: float
 ) -> None:
+    async def steer(player: Player, heard: Listener) -> None:
+        await heard.until(1)
+        await anyio.sleep(3.0)
+        player.pause()
+        await anyio.sleep(100.0)
+        player.resume()
+        if rate is not None:
+            await anyio.sleep(2.0)
+            player.rate = rate
+
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
-    heard: list[float] = []
-
-    async def play() -> None:
-        # The clock of the loop is not at zero at the beginning.
-        await anyio.sleep(1_000.0)
-        with Bus(SimulatedClock() if simulated else None) as bus:
-            first = anyio.Event()
-
-            def hear(_: Batch) -> None:
-                heard.append(anyio.current_time())
-                first.set()
-
-            bus.subscribe(hear)
-            player = Player(bus, path)
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(player.play)
-                await first.wait()
-                await anyio.sleep(3.0)
-                player.pause()
-                await anyio.sleep(100.0)
-                player.resume()
-                if rate is not None:
-                    await anyio.sleep(2.0)
-                    player.rate = rate
-
-    in_virtual_time(play)
-    assert heard[1] - heard[0] == pytest.approx(3.0 + 100.0 + left, abs=1e-6)
+    expected = [0.0, 3.0 + 100.0 + left]
+    assert times_in(path, steer, simulated=simulated) == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize("simulated", [True, False])
 @pytest.mark.parametrize(
     ("goes_on", "left"),
-    [(Player.resume, 10.0), (Player.step, 0.0), (lambda player: setattr(player, "rate", 5.0), math.inf)],
+    # Another rate alone does not end the pause.
+    [(Player.resume, 10.0), (Player.step, 0.0), (lambda player: setattr(player, "rate", 5.0), 1_000.0 + 10.0 / 5.0)],
     ids=["resume", "step", "rate"],
 )
 def test_a_paused_player_that_waits_is_woken_by_what_makes_it_go_on(
     tmp_path: Path, simulated: bool, goes_on: Callable[[Player], None], left: float
 ) -> None:
+    async def steer(player: Player, heard: Listener) -> None:
+        await heard.until(1)
+        player.pause()
+        await anyio.sleep(100.0)
+        goes_on(player)
+        with anyio.move_on_after(1_000.0):
+            await heard.until(2)
+        player.resume()
+
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
-    heard: list[float] = []
-
-    async def play() -> None:
-        with Bus(SimulatedClock() if simulated else None) as bus:
-            events = [anyio.Event(), anyio.Event()]
-
-            def hear(_: Batch) -> None:
-                events[len(heard)].set()
-                heard.append(anyio.current_time())
-
-            bus.subscribe(hear)
-            player = Player(bus, path)
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(player.play)
-                await events[0].wait()
-                player.pause()
-                await anyio.sleep(100.0)
-                goes_on(player)
-                with anyio.move_on_after(1_000.0):
-                    await events[1].wait()
-                tasks.cancel_scope.cancel()
-
-    in_virtual_time(play)
-    # Another rate alone does not end the pause.
-    assert [time - heard[0] for time in heard] == pytest.approx([0.0, 100.0 + left][: 1 + (left < math.inf)], abs=1e-6)
+    assert times_in(path, steer, simulated=simulated) == pytest.approx([0.0, 100.0 + left], abs=1e-6)
 
 
 @pytest.mark.parametrize("simulated", [True, False])
 def test_a_seek_is_followed_at_once_and_a_pause_lasts_beyond_it(tmp_path: Path, simulated: bool) -> None:
+    async def steer(player: Player, heard: Listener) -> None:
+        await heard.until(1)
+        await anyio.sleep(3.0)
+        player.seek(START + 1_000 * SECOND)
+        await heard.until(2)
+        player.pause()
+        await anyio.sleep(100.0)
+        player.seek(START + 1_000 * SECOND)
+        await anyio.sleep(100.0)
+        player.step()
+        await heard.until(3)
+        player.seek(START + 1_999 * SECOND)
+        player.resume()
+        await heard.until(4)
+        assert heard.batches == [(moving("map", "base", START + x * SECOND, float(x), "odometry"),) for x in stops]
+
+    stops = (0, 1_000, 1_000, 2_000)
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1_000.0, 2_000.0)))
-    times: list[float] = []
-
-    async def until(heard: Listener, count: int) -> None:
-        # Without a limit: this clock jumps to it while a thread reads.
-        while len(heard.entries) < count:
-            heard.arrived = anyio.Event()
-            await heard.arrived.wait()
-
-    async def play() -> None:
-        with Bus(SimulatedClock() if simulated else None) as bus:
-            heard = Listener(bus)
-            bus.subscribe(lambda _: times.append(anyio.current_time()))
-            player = Player(bus, path)
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(player.play)
-                await until(heard, 1)
-                await anyio.sleep(3.0)
-                player.seek(START + 1_000 * SECOND)
-                await until(heard, 2)
-                player.pause()
-                await anyio.sleep(100.0)
-                player.seek(START + 1_000 * SECOND)
-                await anyio.sleep(100.0)
-                player.step()
-                await until(heard, 3)
-                player.seek(START + 1_999 * SECOND)
-                player.resume()
-            assert [batch[0].stamp for batch in heard.batches] == [
-                START + seconds * SECOND for seconds in (0, 1_000, 1_000, 2_000)
-            ]
-
-    in_virtual_time(play)
     # The second at once, the third when the step is taken; of the last, a second is left.
-    assert [time - times[0] for time in times] == pytest.approx([0.0, 3.0, 203.0, 204.0], abs=1e-6)
+    assert times_in(path, steer, simulated=simulated) == pytest.approx([0.0, 3.0, 203.0, 204.0], abs=1e-6)
 
 
-@pytest.mark.parametrize("simulated", [True, False])
-@pytest.mark.parametrize("rate", [1e12, 1e300, AS_FAST_AS_POSSIBLE])
-async def test_the_highest_rates_wait_for_nothing(tmp_path: Path, simulated: bool, rate: float) -> None:
-    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0, 1_000_000.0)))
-    with Bus(SimulatedClock() if simulated else None) as bus, anyio.fail_after(PATIENCE):
-        player = Player(bus, path, rate=rate)
-        await player.play()
-    assert player.played == 3
+def test_a_simulated_clock_advances_steadily_between_messages(tmp_path: Path) -> None:
+    seen: list[float] = []
+
+    async def tick(player: Player, _: Listener) -> None:
+        async for number in player.bus.clock.ticks(50.0):
+            assert player.bus.clock.now() == START + number * SECOND // 50
+            seen.append(anyio.current_time())
+            if number == 500:
+                return
+
+    assert times_in(write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0))), tick, rate=4.0)[-1] == 2.5
+    # A step is 20 ms.
+    assert all(abs(number / 50.0 / 4.0 - (time - seen[0])) < 0.021 for number, time in enumerate(seen))
 
 
-def test_at_the_lowest_rates_a_simulated_clock_still_advances(tmp_path: Path) -> None:
-    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 3e-9)))
-    heard: list[float] = []
-
-    async def play() -> None:
-        with Bus(SimulatedClock()) as bus:
-            bus.subscribe(lambda _: heard.append(anyio.current_time()))
-            await Player(bus, path, rate=1e-9).play()
-
-    in_virtual_time(play)
-    assert heard[1] - heard[0] == pytest.approx(3.0)
+def test_a_range_begins_at_since_even_if_the_first_message_is_later(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
+    assert times_in(path, simulated=False, since=START + 4 * SECOND) == pytest.approx([6.0], abs=1e-6)
 
 
 @pytest.mark.parametrize("finish", [True, False])
@@ -546,41 +515,6 @@ async def test_the_event_loop_does_not_read_the_file(tmp_path: Path, finish: boo
         await Player(bus, path, rate=AS_FAST_AS_POSSIBLE).play()
     assert readers
     assert threading.get_ident() not in readers
-
-
-def test_a_simulated_clock_advances_steadily_between_messages(tmp_path: Path) -> None:
-    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
-    seen: list[float] = []
-
-    async def tick(bus: Bus) -> None:
-        async for number in bus.clock.ticks(50.0):
-            assert bus.clock.now() == START + number * SECOND // 50
-            seen.append(anyio.current_time())
-
-    async def play() -> None:
-        with Bus(SimulatedClock(START)) as bus:
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(tick, bus)
-                await Player(bus, path, rate=4.0).play()
-                tasks.cancel_scope.cancel()
-
-    in_virtual_time(play)
-    assert len(seen) == 501
-    # A step is 20 ms.
-    assert all(abs(number / 50.0 / 4.0 - (time - seen[0])) < 0.021 for number, time in enumerate(seen))
-
-
-def test_a_range_begins_at_since_even_if_the_first_message_is_later(tmp_path: Path) -> None:
-    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
-
-    async def play() -> None:
-        with Bus() as bus:
-            player = Player(bus, path, since=START + 4 * SECOND)
-            before = anyio.current_time()
-            await player.play()
-            assert anyio.current_time() - before == pytest.approx(6.0, abs=1e-6)
-
-    in_virtual_time(play)
 
 
 @pytest.mark.parametrize(
