@@ -22,14 +22,8 @@ from tfbus.recording import open_recording
 from tfbus.recording.formats import ros1
 from tfbus.recording.formats.ros1 import (
     CHUNK,
-    DAMAGE,
-    CutOffError,
     Ros1Storage,
-    counts_in,
     find_chunk,
-    index_span,
-    kind_of,
-    parse_fields,
     read_chunk,
     read_record,
     split_chunk,
@@ -125,24 +119,34 @@ def chunks_in(data: bytes) -> list[int]:
 COMPRESSIONS = [None, *Writer.CompressionFormat]
 
 
+def index_place(data: bytes) -> int:
+    """The place in the header of a bag at which is told where its index begins."""
+    return data.index(b"index_pos=") + 10
+
+
+def without_index(data: bytearray) -> bytearray:
+    """The same bag, whose header tells of no index, as that of a writer that was killed."""
+    place = index_place(data)
+    data[place : place + 8] = bytes(8)
+    return data
+
+
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_all_messages_are_read_with_an_index_and_without(
     path: Path, compression: Writer.CompressionFormat | None
 ) -> None:
     data = write_bag(path, compression=compression)
-    assert read(path) == (EXPECTED, [])
-    with open_recording(path) as recording:
-        assert facts(recording) == (10, 159, 61, True)
-    index = int.from_bytes(data[data.index(b"index_pos=") + 10 :][:8], "little")
-    path.write_bytes(data[:index])
-    assert read(path) == (EXPECTED, [])
-    with open_recording(path) as recording:
-        assert facts(recording) == (10, 159, 61, False)
+    (begin,) = struct.unpack_from("<Q", data, index_place(data))
+    for finished in (True, False):
+        path.write_bytes(data if finished else data[:begin])
+        assert read(path) == (EXPECTED, [])
+        with open_recording(path) as recording:
+            assert facts(recording) == (10, 159, 61, finished)
 
 
 def test_a_finished_bag_without_messages_is_an_empty_recording(path: Path) -> None:
     data = bytearray(unfinished())
-    place = data.index(b"index_pos=") + 10
+    place = index_place(data)
     # Its index is behind the header at the earliest.
     for begin in (len(data), len(data) - 1):
         data[place : place + 8] = begin.to_bytes(8, "little")
@@ -171,9 +175,7 @@ def test_the_last_chunk_of_a_writer_that_was_killed_is_read(
     data[last.data - 4 : last.data] = bytes(4)
     size = data.index(b"size=", last.offset) + 5
     data[size : size + 4] = bytes(4)
-    place = data.index(b"index_pos=") + 10
-    data[place : place + 8] = bytes(8)
-    path.write_bytes(data[: last.end])
+    path.write_bytes(without_index(data)[: last.end])
     assert read(path) == (EXPECTED, [])
 
 
@@ -195,10 +197,7 @@ def test_a_damaged_chunk_header_loses_one_chunk(path: Path, indexed: bool) -> No
     data = bytearray(write_bag(path))
     second, third = chunks_in(bytes(data))[1:3]
     data[second + 3] ^= 0x40
-    if not indexed:
-        place = data.index(b"index_pos=") + 10
-        data[place : place + 8] = bytes(8)
-    path.write_bytes(data)
+    path.write_bytes(data if indexed else without_index(data))
     _, lost = read_all_but_a_chunk(path)
     assert (f"the chunk at byte {second}: " if indexed else f"from byte {second} to byte {third}") in lost[0]
 
@@ -209,9 +208,7 @@ def test_a_chunk_that_claims_to_hold_those_behind_it_hides_none_of_them(path: Pa
     with path.open("rb") as file:
         begin = read_record(file, second).data
     data[begin - 1] ^= 0x40
-    place = data.index(b"index_pos=") + 10
-    data[place : place + 8] = bytes(8)
-    path.write_bytes(data)
+    path.write_bytes(without_index(data))
     _, lost = read_all_but_a_chunk(path)
     (size,) = struct.unpack_from("<I", data, begin - 4)
     assert f"nothing can be read from byte {second} to byte {third}: a chunk claims {size:,} bytes" in lost[0]
@@ -231,7 +228,7 @@ def test_a_chunk_that_claims_too_much_is_not_unfolded(path: Path) -> None:
 
 def test_an_index_is_used_up_to_its_bound(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = write_bag(path)
-    size = len(data) - int.from_bytes(data[data.index(b"index_pos=") + 10 :][:8], "little")
+    size = len(data) - struct.unpack_from("<Q", data, index_place(data))[0]
     for bound, finished in ((size, True), (size - 1, False)):
         monkeypatch.setattr("tfbus.recording.formats.ros1.MAX_INDEX", bound)
         with open_recording(path) as recording:
@@ -392,12 +389,6 @@ def test_messages_are_split_whatever_the_order_of_the_fields() -> None:
     assert (content.connections, content.damage) == ([], "")
 
 
-def test_connections_are_split_from_the_messages_and_other_records_are_passed_over() -> None:
-    described = field(b"conn", bytes(4)) + field(b"op", b"\7")
-    content = split_chunk(record(described, b"type=a") + record(field(b"op", b"\4"), b"index") + message(0, 2, b"x"))
-    assert content == ([(2_000_000_005, 0, b"x")], [({b"conn": bytes(4), b"op": b"\7"}, b"type=a")], "")
-
-
 @pytest.mark.parametrize("order", ["".join(order) for order in permutations("cot")])
 def test_a_damaged_header_is_read_behind_a_good_one_of_its_length_as_it_is_alone(order: str) -> None:
     first, second = message(1, 2, b"x", order), message(7, 3, b"y", order)
@@ -430,7 +421,7 @@ def test_a_chunk_is_found_by_its_bytes() -> None:
     # Also across the blocks that are read at once.
     for size in (2**20 - 30, 2**20 - 5, 2**20 + 3):
         assert find_chunk(io.BytesIO(bytes(size) + CHUNK_RECORD), 0) == size
-    # What looks like one in the block before, and where the file stands, do not matter.
+    # A look-alike in the block before and the position of the file do not matter.
     file = io.BytesIO(noise + bytes(2**20) + CHUNK_RECORD)
     file.seek(2**20)
     assert find_chunk(file, 0) == len(noise) + 2**20
@@ -472,24 +463,3 @@ def test_a_chunk_is_unfolded_up_to_its_bound_and_has_the_size_that_it_claims(mon
     ):
         with pytest.raises(ValueError, match=why):
             content(size, data, torn)
-
-
-def test_damage_is_an_error() -> None:
-    with pytest.raises(CutOffError):
-        read_record(io.BytesIO(CHUNK_RECORD[:10]), 0)
-    with pytest.raises(ValueError, match="claims 4,294,967,295 bytes"):
-        read_record(io.BytesIO(b"\xff" * 20), 0)
-    for fields in (b"\5\0\0\0abcde", b"\xff\0\0\0a=b"):
-        with pytest.raises(DAMAGE):
-            parse_fields(fields)
-    for kind in ({b"op": b"\1"}, {b"op": b"\x08"}, {b"op": b""}, {}):
-        with pytest.raises(DAMAGE):
-            kind_of(kind)
-
-
-def test_the_counts_of_an_index_are_read_as_far_as_they_go() -> None:
-    for rest in range(8):
-        assert counts_in(struct.pack("<6I", 3, 10, 4, 20, 5, 30) + bytes(rest)) == {3: 10, 4: 20, 5: 30}
-    for rest in range(12):
-        entries = struct.pack("<6I", 1, 2, 0, 3, 4, 0) + bytes(rest)
-        assert index_span(entries) == (1_000_000_002, 3_000_000_004, 2)

@@ -2,7 +2,6 @@
 
 import bz2
 import io
-import re
 import tracemalloc
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -10,7 +9,6 @@ from pathlib import Path
 from random import Random
 
 import lz4.frame
-import numpy as np
 import pytest
 import zstandard
 from hypothesis import given
@@ -67,13 +65,6 @@ def test_packed_messages_are_those_that_were_packed_in_the_order_of_their_log_ti
     assert sum(packed.counts().values()) == len(stored)
     expected = sorted((each for each in stored if low <= each[0] <= high), key=lambda each: each[0])
     assert unpacked(in_order(packed, low, high)) == expected
-
-
-def test_a_log_time_that_is_no_stamp_comes_last_and_one_by_one() -> None:
-    packed = pack([(5, A, b"x"), (3, B, b"y")])
-    assert packed is not None
-    wrong = Packed(packed.data, packed.channels, packed.numbers, np.array([-1, 3]), packed.starts, packed.ends)
-    assert list(in_order(wrong, 0, 9)) == [[(3, B, b"y"), (2**64 - 1, A, b"x")]]
 
 
 def test_batches_are_bounded_by_number_and_by_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,23 +196,3 @@ def test_a_file_unfolds_into_another_up_to_the_bound() -> None:
 def test_a_small_file_unfolds_to_64_mib_and_a_large_one_to_100_times_its_size() -> None:
     assert max_unpacked(1) == max_unpacked(64 * MIB // 100) == 64 * MIB
     assert max_unpacked(MIB) == 100 * MIB
-
-
-def test_the_bounds_are_those_that_open_recording_tells() -> None:
-    text = " ".join((open_recording.__doc__ or "").partition("Notes")[2].split())
-    names = (
-        "MAX_MESSAGE",
-        "MAX_OTHER_MESSAGE",
-        "MAX_METADATA",
-        "MIN_UNPACKED",
-        "MAX_INDEX",
-        "MAX_DESCRIBED",
-        "MAX_OVERLAPPING",
-    )
-    assert [int(number) * 2**20 for number in re.findall(r"(\d+) MiB", text)] == [
-        getattr(storage, name) for name in names
-    ]
-    assert storage.MAX_CHUNK == storage.MAX_OTHER_MESSAGE
-    assert "a million messages" in text
-    assert storage.MAX_CHUNK_MESSAGES == 1_000_000
-    assert f"at most {storage.MAX_FACTOR} times" in text
