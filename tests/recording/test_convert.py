@@ -52,11 +52,6 @@ LINES: list[Line] = [
 EXPECTED = [(received, tuple(samples)) for received, _, samples in LINES]
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "run.mcap"
-
-
 def raw(path: Path) -> list[tuple[int, str, list[RawTransform]]]:
     """Log time, topic and the transforms of all messages, bit by bit."""
     storage = open_storage(path)

@@ -40,11 +40,6 @@ ERRORS: dict[str, type[TransformLookupError]] = {
 }
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "run.mcap"
-
-
 def disagreement(tree: TransformTree, answer: dict[str, Any]) -> str:
     """The answers of the tree that differ from those of tf2."""
     at = LATEST if answer["at"] is None else answer["at"]

@@ -52,12 +52,6 @@ AS_FAST_AS_POSSIBLE = math.inf
 START = 1_700_000_000 * SECOND
 
 
-@pytest.fixture
-def bus() -> Iterator[Bus]:
-    with Bus(SimulatedClock()) as bus:
-        yield bus
-
-
 def write_recording(path: Path, *entries: TimedBatch) -> Path:
     """A recording with batches at log times."""
     with closing(McapOutput(str(path), overwrite=True)) as output:

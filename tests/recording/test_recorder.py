@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from io import BytesIO
 from itertools import count
@@ -41,21 +41,8 @@ from tfbus.recording.recording import open_recording
 
 pytestmark = pytest.mark.anyio
 
-Run = Callable[[Callable[[], Awaitable[None]]], None]
-
 PATIENCE = 60.0
 """Real seconds after which a test that hangs is given up."""
-
-
-@pytest.fixture
-def bus() -> Iterator[Bus]:
-    with Bus(SimulatedClock()) as bus:
-        yield bus
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "run.mcap"
 
 
 def recorded(path: Path) -> list[tuple[int, tuple[TransformStamped, ...]]]:
@@ -574,34 +561,6 @@ def test_a_recorder_that_has_not_begun_has_a_name_and_counts_nothing(tmp_path: P
     assert recorder.statistics() == RecorderStatistics(0, 0, 0, {}, queue)
 
 
-def test_a_slice_has_at_least_one_batch_and_otherwise_no_more_samples_than_its_size() -> None:
-    queue = WriteQueue(100)
-    for size in (2, 3, 9, 1):
-        queue.put(tuple(moving("map", "a", stamp) for stamp in range(size)), 0)
-    assert [[len(batch) for _, batch in queue.get_slice(5)] for _ in range(3)] == [[2, 3], [9], [1]]
-
-
-def test_static_samples_of_dropped_batches_come_first_with_their_own_times() -> None:
-    queue = WriteQueue(1)
-    queue.put((static("map", "a"), moving("map", "b", 1)), 0)
-    queue.put((static("map", "c"), moving("map", "b", 2)), 1)
-    queue.put((moving("map", "b", 3),), 2)
-    assert len(queue) == 3
-    assert queue.get_slice(10) == [
-        (0, (static("map", "a"),)),
-        (1, (static("map", "c"),)),
-        (2, (moving("map", "b", 3),)),
-    ]
-
-
-def test_batches_of_static_samples_alone_are_bounded_and_the_replaced_ones_are_counted() -> None:
-    queue = WriteQueue(3)
-    for number in range(1_000):
-        queue.put((static("map", f"s{number % 2}", x=float(number)),), number)
-    assert queue.statistics("recording") == QueueStatistics("recording", "drop_oldest", 3, 5, 0, 995)
-    assert [sample.transform.translation[0] for _, (sample,) in queue.get_slice(10)] == [995, 996, 997, 998, 999]
-
-
 steps = st.lists(st.lists(any_samples("abc", 3), min_size=1, max_size=5) | st.integers(1, 8), max_size=40)
 
 
@@ -618,10 +577,15 @@ def test_every_sample_is_read_or_counted_and_the_newest_static_ones_are_read(
     read: list[tuple[int, TransformStamped]] = []
     for now, step in enumerate(steps):
         if isinstance(step, int):
-            read += [(published, sample) for published, batch in queue.get_slice(step) for sample in batch]
+            batches = queue.get_slice(step)
+            # A single batch may be larger, and so may the kept static samples.
+            assert len(batches) == 1 or sum(len(batch) for _, batch in batches) <= max(step, len("abc"))
+            read += [(published, sample) for published, batch in batches for sample in batch]
         else:
             queue.put(tuple(step), now)
             put += step
+        # Batches are bounded as well as samples, each has up to five, and a static sample of each child is kept.
+        assert len(queue) <= 5 * capacity + len("abc")
     # Within the capacity, except for a single batch that is larger.
     assert count_moving(put) - queue.dropped - count_moving([sample for _, sample in read]) <= max(capacity, 5)
     while batches := queue.get_slice(3):

@@ -27,11 +27,6 @@ from tfbus.tf_message import encode
 MS = 1_000_000
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "run.mcap"
-
-
 def summary_of(path: Path) -> RecordingSummary:
     with open_recording(path) as recording:
         return summarise(recording)

@@ -8,11 +8,11 @@ import pytest
 import zstandard
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
-from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in, without_unfinished, write_mcap
+from support.recorded import SMALL, as_ros2, batches_in, facts, in_blocks, messages_in, without_unfinished, write_mcap
 from support.samples import moving
 
 from tfbus import RecordingError
-from tfbus.recording import RecordedMessage, open_recording
+from tfbus.recording import open_recording
 
 ZSTD = {"fmt": CompressionFormat.ZSTD}
 LINES = [(time, "/tf", [moving("odom", "base", time)]) for time in range(30)]
@@ -42,12 +42,6 @@ def test_what_ros_2_records_is_read_compressed_or_not(
     with open_recording(folder) as recording, open_recording(SMALL) as bag:
         assert facts(recording) == facts(bag)
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def in_blocks(path: Path) -> list[RecordedMessage]:
-    """All messages of a recording, as they are in its blocks."""
-    with open_recording(path) as recording:
-        return [message for block in recording.blocks() for message in block.messages()]
 
 
 def test_several_files_are_one_recording_in_the_order_of_their_times(tmp_path: Path) -> None:

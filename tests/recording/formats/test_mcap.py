@@ -20,7 +20,16 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, IndexType, Writer
-from support.recorded import Line, batches_in, facts, messages_in, without_unfinished, write_blocks, write_mcap
+from support.recorded import (
+    Line,
+    batches_in,
+    facts,
+    in_blocks,
+    messages_in,
+    without_unfinished,
+    write_blocks,
+    write_mcap,
+)
 from support.samples import moving, static
 
 from tfbus import RecordingError
@@ -57,12 +66,6 @@ def damage(path: Path, part: bytes) -> None:
     data = bytearray(path.read_bytes())
     data[data.index(part)] ^= 1
     path.write_bytes(data)
-
-
-def in_blocks(path: Path, since: int | None = None, until: int | None = None) -> list[RecordedMessage]:
-    """All messages of a recording, as they are in its blocks, without the report that its index is missing."""
-    with open_recording(path) as recording:
-        return without_unfinished(message for block in recording.blocks(since, until) for message in block.messages())
 
 
 def errors_in(messages: list[RecordedMessage]) -> list[str]:
