@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.writer import Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
@@ -21,7 +23,7 @@ from support.recorded import SMALL, as_ros2, messages_in, without_unfinished, wr
 from support.samples import moving, static
 
 from tfbus import InvalidTransformError, RecordingError
-from tfbus.recording import RecordedTopic, open_recording
+from tfbus.recording import RecordedTopic, convert, open_recording
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.recording import Choice, Selection, looks_like_transforms
 from tfbus.tf_message import encode
@@ -87,6 +89,30 @@ def test_good_transforms_come_with_the_errors_of_the_bad_ones(tmp_path: Path) ->
     (error,) = message.errors
     assert isinstance(error, InvalidTransformError)
     assert (error.reason, error.child) == ("not finite", "c")
+
+
+@pytest.mark.parametrize(("suffix", "options"), [("mcap", {}), ("mcap", {"enable_crcs": False}), ("bag", {})], ids=str)
+@given(data=st.data())
+def test_one_flipped_bit_never_loses_a_message_in_silence(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, suffix: str, options: dict[str, Any]
+) -> None:
+    folder = tmp_path_factory.mktemp("recording")
+    lines = [(k, "/tf", [moving("odom", "base", k)]) for k in range(15)]
+    path = write_mcap(folder / "source.mcap", lines, chunk_size=500, **options)
+    if suffix == "bag":
+        convert([path], folder / "run.bag")
+        path = folder / "run.bag"
+    whole = bytearray(path.read_bytes())
+    whole[data.draw(st.integers(0, len(whole) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(whole)
+    try:
+        messages = messages_in(path)
+    except RecordingError:
+        return
+    with open_recording(path) as recording:
+        told = recording.remarks or not recording.finished
+    read = sum(bool(message.batch) for message in messages)
+    assert read == 15 or told or any(message.errors for message in messages)
 
 
 def test_a_closed_recording_cannot_be_read(recording: Path) -> None:
@@ -268,7 +294,7 @@ def test_a_topic_that_was_asked_for_is_there_with_transforms(tmp_path: Path) -> 
         open_recording(path, topics="/camera")
     assert str(raised.value).endswith("topic 'camera' has type sensor_msgs/msg/Image, which holds no transforms")
     assert raised.value.reason == "no such topic"
-    # What an unfinished file has, only reading it tells.
+    # Only reading an unfinished file tells which topics it has.
     path = write_mcap(path, [(1, "/camera", b"")], schema="sensor_msgs/msg/Image", finish=False)
     with open_recording(path, topics="/camera") as recording:
         assert without_unfinished(recording.messages()) == []

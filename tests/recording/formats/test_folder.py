@@ -223,7 +223,7 @@ def test_a_compressed_file_unfolds_up_to_a_bound_and_nothing_of_it_stays(
     assert list(temporary.iterdir()) == []
     whole = as_ros2(SMALL, tmp_path / "whole", StoragePlugin.SQLITE3, mode=CompressionMode.FILE, **ZSTD)
     with open_recording(whole) as recording:
-        # What reads it has it open, and it has no name.
+        # The reader has it open, and it has no name.
         assert list(temporary.iterdir()) == []
         assert sum(bool(message.batch) for message in recording.messages()) > 700
 
