@@ -19,6 +19,13 @@ LINES = [(time, "/tf", [moving("odom", "base", time)]) for time in range(30)]
 EXPECTED = [(time, tuple(samples)) for time, _, samples in LINES]
 
 
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with one file."""
+    write_mcap(tmp_path / "run_0.mcap", LINES)
+    return tmp_path
+
+
 @pytest.mark.parametrize("storage", StoragePlugin)
 @pytest.mark.parametrize(
     "options",
@@ -57,17 +64,16 @@ def test_several_files_are_one_recording_in_the_order_of_their_times(tmp_path: P
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"nonsense"])
-def test_a_file_that_cannot_be_read_is_told_and_the_others_are_read(tmp_path: Path, content: bytes) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    (tmp_path / "run_1.mcap").write_bytes(content)
-    lost, *rest = messages_in(tmp_path)
+def test_a_file_that_cannot_be_read_is_told_and_the_others_are_read(folder: Path, content: bytes) -> None:
+    (folder / "run_1.mcap").write_bytes(content)
+    lost, *rest = messages_in(folder)
     assert (lost.received, [error.reason for error in lost.errors]) == (0, ["damaged"])
     assert "run_1.mcap" in str(lost.errors[0])
     assert [(message.received, message.batch) for message in rest] == EXPECTED
-    with open_recording(tmp_path) as recording:
+    with open_recording(folder) as recording:
         assert not recording.finished
     # Told once, also where what was static before is looked for.
-    assert sum(bool(message.errors) for message in messages_in(tmp_path, since=5)) == 1
+    assert sum(bool(message.errors) for message in messages_in(folder, since=5)) == 1
 
 
 def test_what_cannot_be_read_is_told_at_the_start_of_the_recording_or_of_the_range(tmp_path: Path) -> None:
@@ -115,20 +121,18 @@ def metadata(folder: Path, *files: str, topic: str = "/tf", count: int = 0) -> N
     )
 
 
-def test_a_folder_is_what_its_metadata_name(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    write_mcap(tmp_path / "stray.mcap", LINES)
+def test_a_folder_is_what_its_metadata_name(folder: Path) -> None:
+    write_mcap(folder / "stray.mcap", LINES)
     # As old versions wrote it, with the folder before the name.
-    metadata(tmp_path, "run/run_0.mcap", count=30)
-    assert batches_in(tmp_path) == EXPECTED
-    with open_recording(tmp_path) as recording:
+    metadata(folder, "run/run_0.mcap", count=30)
+    assert batches_in(folder) == EXPECTED
+    with open_recording(folder) as recording:
         assert recording.remarks == ("stray.mcap is ignored: metadata.yaml does not name it",)
 
 
-def test_a_file_that_the_metadata_name_and_is_not_there_is_told(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    metadata(tmp_path, "run_0.mcap", "run_1.mcap", count=30)
-    lost, *rest = messages_in(tmp_path)
+def test_a_file_that_the_metadata_name_and_is_not_there_is_told(folder: Path) -> None:
+    metadata(folder, "run_0.mcap", "run_1.mcap", count=30)
+    lost, *rest = messages_in(folder)
     assert "run_1.mcap': there is no such file" in str(lost.errors[0])
     assert len(rest) == 30
 
@@ -146,11 +150,10 @@ def test_a_name_that_leads_out_of_the_folder_does_not(tmp_path: Path) -> None:
     [("/tf", 31, "promises 31 messages on '/tf', and 30 were found"), ("/gone", 3, "promises 3 messages on '/gone'")],
 )
 def test_what_the_metadata_promise_and_the_files_do_not_have_is_told(
-    tmp_path: Path, topic: str, count: int, says: str
+    folder: Path, topic: str, count: int, says: str
 ) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    metadata(tmp_path, "run_0.mcap", topic=topic, count=count)
-    *_, lost = messages_in(tmp_path)
+    metadata(folder, "run_0.mcap", topic=topic, count=count)
+    *_, lost = messages_in(folder)
     assert says in str(lost.errors[0])
     assert lost.received == 29
 
@@ -172,33 +175,30 @@ def test_what_the_metadata_promise_of_topics_that_are_not_read_is_not_told(tmp_p
         ("- 1", "list indices must be integers"),
     ],
 )
-def test_metadata_that_cannot_be_read_are_ignored_with_a_remark(tmp_path: Path, text: str, why: str) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    (tmp_path / "metadata.yaml").write_text(text)
-    assert batches_in(tmp_path) == EXPECTED
-    with open_recording(tmp_path) as recording:
+def test_metadata_that_cannot_be_read_are_ignored_with_a_remark(folder: Path, text: str, why: str) -> None:
+    (folder / "metadata.yaml").write_text(text)
+    assert batches_in(folder) == EXPECTED
+    with open_recording(folder) as recording:
         assert recording.remarks[0].startswith(f"metadata.yaml is ignored, as it cannot be read: {why}")
 
 
-def test_metadata_are_read_up_to_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    write_mcap(tmp_path / "stray.mcap", LINES)
-    metadata(tmp_path, "run_0.mcap", count=30)
-    size = (tmp_path / "metadata.yaml").stat().st_size
+def test_metadata_are_read_up_to_a_bound(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_mcap(folder / "stray.mcap", LINES)
+    metadata(folder, "run_0.mcap", count=30)
+    size = (folder / "metadata.yaml").stat().st_size
     why = f"it has more than {size - 1} bytes, which is the bound"
     for bound, remark in (
         (size, "stray.mcap is ignored: metadata.yaml does not name it"),
         (size - 1, f"metadata.yaml is ignored, as it cannot be read: {why}"),
     ):
         monkeypatch.setattr("tfbus.recording.formats.folder.MAX_METADATA", bound)
-        with open_recording(tmp_path) as recording:
+        with open_recording(folder) as recording:
             assert recording.remarks == (remark,)
 
 
-def test_metadata_that_promise_nothing_on_a_topic_that_no_file_has_are_kept(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    metadata(tmp_path, "run_0.mcap", topic="/gone", count=0)
-    assert batches_in(tmp_path) == EXPECTED
+def test_metadata_that_promise_nothing_on_a_topic_that_no_file_has_are_kept(folder: Path) -> None:
+    metadata(folder, "run_0.mcap", topic="/gone", count=0)
+    assert batches_in(folder) == EXPECTED
 
 
 def test_without_metadata_an_uncompressed_file_hides_the_compressed_one(tmp_path: Path) -> None:

@@ -76,16 +76,6 @@ def test_the_official_reader_reads_topics_times_and_transforms(path: Path) -> No
     assert decode(found[1][6]).samples == [moving("map", "a", 3, x=0.1), plain(turned)]
 
 
-def test_a_batch_of_both_kinds_is_a_message_on_each_topic(path: Path) -> None:
-    written(path, (5, (moving("map", "a", 1), static("a", "b"), moving("a", "c", 2), static("a", "d"))))
-    with Reader(path) as reader:
-        found = {each.topic: (time, decode(raw).samples) for each, time, raw in reader.messages()}
-    assert found == {
-        "/tf_static": (5, [moving("a", "b", 0), moving("a", "d", 0)]),
-        "/tf": (5, [moving("map", "a", 1), moving("a", "c", 2)]),
-    }
-
-
 def test_a_child_that_changes_its_kind_within_a_batch_has_the_last_one(path: Path) -> None:
     written(path, (5, (moving("map", "a", 1), static("map", "b"), static("map", "a"), moving("map", "b", 2))))
     with Reader(path) as reader:
