@@ -31,14 +31,12 @@ from tfbus.recording.formats.copies import (
     McapCopy,
     MessageTypes,
     SqliteCopy,
-    foxglove_channel,
-    write_protobuf,
 )
 from tfbus.recording.formats.mcap_output import TYPE_HASH
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.formats.transforms import RawTransform, parser_of, write_cdr, write_ros1
 from tfbus.recording.recording import open_storage
-from tfbus.tf_message import MalformedMessageError, encode
+from tfbus.tf_message import encode
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 TF = "tf2_msgs/msg/TFMessage"
@@ -513,16 +511,3 @@ def test_the_definition_of_a_type_of_ros_2_has_the_digest_of_ros_1(kind: str, di
     assert found == digest
     # A header counts the messages there, which ROS 2 has given up.
     assert ("uint32 seq\ntime stamp\nstring frame_id\n" in definition) == (kind != "std_msgs/msg/String")
-
-
-def test_the_seconds_that_a_stamp_of_foxglove_holds_are_written() -> None:
-    for seconds in (-(2**63), -1, 2**63 - 1):
-        edge = RawTransform(seconds, 0, b"map", b"base", bytes(56))
-        assert parser_of(foxglove_channel(CDR, {}))(write_protobuf([edge])) == [edge]
-    # A negative number has ten bytes, as one of 64 bits in two's complement.
-    before = RawTransform(-1, 0, b"map", b"base", bytes(56))
-    assert b"\x08" + b"\xff" * 9 + b"\x01\x10" in write_protobuf([before])
-    for seconds in (-(2**63) - 1, 2**63):
-        with pytest.raises(MalformedMessageError, match=f"{seconds} s does not fit the stamp") as raised:
-            write_protobuf([RawTransform(seconds, 0, b"map", b"base", bytes(56))])
-        assert raised.value.reason == "stamp"

@@ -144,34 +144,6 @@ def test_a_message_whose_log_time_is_no_stamp_is_reported_and_the_others_are_rea
         assert len(found) == 3 + finish
 
 
-@given(
-    times=st.lists(st.integers(0, 30), max_size=40),
-    lengths=st.lists(st.integers(1, 3), min_size=1, max_size=5),
-    chunk_size=st.integers(1, 2_000),
-    ends=st.tuples(*[st.integers(0, 30)] * 2),
-)
-def test_messages_are_ordered_by_log_time_wherever_they_are_in_the_file(
-    tmp_path_factory: pytest.TempPathFactory,
-    times: list[int],
-    lengths: list[int],
-    chunk_size: int,
-    ends: tuple[int, int],
-) -> None:
-    # Frames with names of several lengths take turns, between messages of a topic that is not read.
-    lines: list[Line] = [
-        (time, "/tf", [moving("a", "b" * length, place)])
-        for place, (time, length) in enumerate(zip(times, cycle(lengths), strict=False))
-    ]
-    mixed = [each for line in lines for each in (line, (line[0], "/camera", b"picture"))]
-    path = tmp_path_factory.mktemp("recording") / "run.mcap"
-    write_mcap(path, mixed, chunk_size=chunk_size)
-    by_time = sorted((time, place) for place, time in enumerate(times))
-    for since, until in ((0, 30), ends):
-        expected = [(time, place) for time, place in by_time if since <= time <= until]
-        for messages in (messages_in(path, since, until), in_blocks(path, since, until)):
-            assert [(message.received, message.batch[0].stamp) for message in messages] == expected
-
-
 def test_only_the_chunks_of_the_range_are_read(write: Write) -> None:
     path = write(LINES)
     # A chunk has ten messages or less: these are far from the first and the last one.
@@ -319,26 +291,6 @@ def test_a_record_of_an_unknown_kind_is_told_with_its_place_and_a_private_one_is
     path.write_bytes(data + private + unknown + data[8:])
     (lost,) = errors_in(messages_in(path))
     assert lost.endswith(f"the record at byte {len(data) + len(private)}: its kind, 127, is unknown")
-
-
-@given(data=st.data())
-def test_changed_bytes_never_lead_to_other_samples_than_the_recorded_ones(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
-    path = tmp_path_factory.mktemp("recording") / "run.mcap"
-    finish = data.draw(st.booleans())
-    whole = bytearray(
-        write_mcap(path, LINES, compression=data.draw(st.sampled_from(CompressionType)), finish=finish).read_bytes()
-    )
-    for place in data.draw(st.lists(st.integers(0, len(whole) - 1), min_size=1, max_size=3)):
-        whole[place] = data.draw(st.integers(0, 255))
-    path.write_bytes(whole)
-    try:
-        messages = messages_in(path)
-    except RecordingError:
-        return
-    read = [(message.received, message.batch) for message in messages if message.batch]
-    assert all(line in EXPECTED for line in read)
 
 
 AUTHORITIES = "tfbus.authorities"
