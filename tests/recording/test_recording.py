@@ -9,17 +9,18 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from support.processes import OPEN_FILES, is_open
-from support.recorded import SMALL, as_ros2, messages_in, without_unfinished, write_mcap
+from support.recorded import SMALL, Line, as_ros2, in_blocks, messages_in, without_unfinished, write_mcap
 from support.samples import moving, static
 
 from tfbus import InvalidTransformError, RecordingError
@@ -91,7 +92,55 @@ def test_good_transforms_come_with_the_errors_of_the_bad_ones(tmp_path: Path) ->
     assert (error.reason, error.child) == ("not finite", "c")
 
 
-@pytest.mark.parametrize(("suffix", "options"), [("mcap", {}), ("mcap", {"enable_crcs": False}), ("bag", {})], ids=str)
+@pytest.mark.parametrize("suffix", ["mcap", "bag", "db3"])
+@given(
+    times=st.lists(st.integers(0, 30), max_size=40),
+    lengths=st.lists(st.integers(1, 3), min_size=1, max_size=5),
+    chunk_size=st.integers(1, 2_000),
+    ends=st.tuples(*[st.integers(0, 30)] * 2),
+)
+# One chunk has all messages.
+@example(times=[3, 1, 2], lengths=[1, 2], chunk_size=2_000, ends=(1, 2))
+# Each chunk ends behind the beginning of the next one, or of very many.
+@example(times=[k + (15 if k % 10 == 9 else 0) for k in range(200)], lengths=[1], chunk_size=500, ends=(40, 90))
+@example(times=[k + (100 if k % 10 == 9 else 0) for k in range(200)], lengths=[1], chunk_size=500, ends=(40, 90))
+def test_messages_are_ordered_by_log_time_wherever_they_are_in_the_file(
+    tmp_path_factory: pytest.TempPathFactory,
+    suffix: str,
+    times: list[int],
+    lengths: list[int],
+    chunk_size: int,
+    ends: tuple[int, int],
+) -> None:
+    # Frames with names of several lengths take turns, between messages of a topic that is not read.
+    lines: list[Line] = [
+        (time, "/tf", [moving("a", "b" * length, place)])
+        for place, (time, length) in enumerate(zip(times, cycle(lengths), strict=False))
+    ]
+    mixed = [each for line in lines for each in (line, (line[0], "/camera", b"picture"))]
+    folder = tmp_path_factory.mktemp("recording")
+    path = write_mcap(folder / "run.mcap", mixed, chunk_size=chunk_size)
+    if suffix != "mcap":
+        convert([path], path.with_suffix(f".{suffix}"))
+        path = path.with_suffix(f".{suffix}")
+    by_time = sorted((time, place) for place, time in enumerate(times))
+    for since, until in ((0, 300), ends):
+        expected = [(time, place) for time, place in by_time if since <= time <= until]
+        for messages in (messages_in(path, since, until), in_blocks(path, since, until)):
+            assert [(message.received, message.batch[0].stamp) for message in messages] == expected
+
+
+@pytest.mark.parametrize(
+    ("suffix", "options"),
+    [
+        ("mcap", {}),
+        ("mcap", {"compression": CompressionType.ZSTD}),
+        ("mcap", {"use_chunking": False}),
+        ("mcap", {"enable_crcs": False}),
+        ("bag", {}),
+    ],
+    ids=str,
+)
 @given(data=st.data())
 def test_one_flipped_bit_never_loses_a_message_in_silence(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, suffix: str, options: dict[str, Any]
