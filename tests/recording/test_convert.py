@@ -8,7 +8,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import zstandard
 from hypothesis import given
@@ -27,6 +26,7 @@ from tfbus.recording import Conversion, Edits, convert, load, open_recording
 from tfbus.recording.formats.copies import (
     BagCopy,
     CannotWriteError,
+    Copy,
     FoxgloveCopy,
     McapCopy,
     MessageTypes,
@@ -53,15 +53,12 @@ EXPECTED = [(received, tuple(samples)) for received, _, samples in LINES]
 
 def raw(path: Path) -> list[tuple[int, str, list[RawTransform]]]:
     """Log time, topic and the transforms of all messages, bit by bit."""
-    storage = open_storage(path)
-    try:
+    with closing(open_storage(path)) as storage:
         return [
             (received, channel.topic, parser_of(channel)(payload))
             for received, channel, payload in storage.messages(lambda channel: channel.topic in ("/tf", "/tf_static"))
             if isinstance(channel, Channel)
         ]
-    finally:
-        storage.close()
 
 
 @pytest.mark.parametrize("first", ENDINGS)
@@ -314,6 +311,13 @@ def test_foxglove_transforms_become_those_of_ros(tmp_path: Path, path: Path) -> 
         assert [topic.type for topic in recording.topics] == ["foxglove.FrameTransforms"]
 
 
+def raw_of(found: Any) -> RawTransform:
+    """A decoded transform of Foxglove's."""
+    numbers = [getattr(found.translation, axis) for axis in "xyz"] + [getattr(found.rotation, axis) for axis in "xyzw"]
+    names = found.parent_frame_id.encode(), found.child_frame_id.encode()
+    return RawTransform(found.timestamp.seconds, found.timestamp.nanos, *names, struct.pack("<7d", *numbers))
+
+
 def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: Path, path: Path) -> None:
     done = convert([SMALL], path, schema="foxglove")
     assert done.problems == {}
@@ -326,19 +330,9 @@ def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: P
     from mcap_protobuf.decoder import DecoderFactory
 
     with path.open("rb") as file:
-        decoded = [
-            message for *_, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
-        ]
-    for (_, _, transforms), message in zip(raw(SMALL), decoded, strict=True):
-        assert [(each.parent_frame_id.encode(), each.child_frame_id.encode()) for each in message.transforms] == [
-            (each.parent, each.child) for each in transforms
-        ]
-        for each, found in zip(transforms, message.transforms, strict=True):
-            numbers = [getattr(found.translation, axis) for axis in "xyz"] + [
-                getattr(found.rotation, axis) for axis in "xyzw"
-            ]
-            np.testing.assert_equal(numbers, struct.unpack("<7d", each.numbers))
-            assert (found.timestamp.seconds, found.timestamp.nanos) == (each.seconds, each.nanoseconds)
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        decoded = [list(map(raw_of, message.transforms)) for *_, message in reader.iter_decoded_messages()]
+    assert decoded == [transforms for _, _, transforms in raw(SMALL)]
     convert([path], tmp_path / "back.bag")
     assert raw(tmp_path / "back.bag") == raw(SMALL)
 
@@ -402,12 +396,15 @@ def test_names_are_compared_without_their_slashes() -> None:
 PAYLOAD = encode([moving("a", "b", 5)])
 
 
+def write_all(copy: Copy, *messages: tuple[Channel, int, bytes]) -> None:
+    for channel, received, payload in messages:
+        copy.write(channel, received, payload)
+    copy.finish()
+
+
 def test_a_copy_in_mcap_is_a_recording_of_ros_2(tmp_path: Path) -> None:
     path = tmp_path / "run"
-    copy = McapCopy(path, "run")
-    copy.write(Channel("/log", "", "json"), 5, b"{}")
-    copy.write(CDR, 6, PAYLOAD)
-    copy.finish()
+    write_all(McapCopy(path, "run"), (Channel("/log", "", "json"), 5, b"{}"), (CDR, 6, PAYLOAD))
     with path.open("rb") as file:
         reader = make_reader(file)
         assert [(entry.name, entry.metadata) for entry in reader.iter_metadata()] == [("rosbag2", {})]
@@ -441,22 +438,18 @@ def test_without_the_extra_a_copy_in_foxglove_s_schema_makes_no_file(
 
 def test_the_definition_of_a_type_stays_where_it_is_one_of_ros_2(tmp_path: Path) -> None:
     path = tmp_path / "run.db3"
-    copy = SqliteCopy(path, "run.db3")
-    for kind, encoding in (("a/msg/A", "ros2msg"), ("b/msg/B", "ros2idl"), ("c/msg/C", "")):
-        copy.write(Channel(f"/{kind}", kind, "cdr", encoding, b"int8 x"), 1, b"")
-    copy.write(Channel("/tf", CDR.type, "cdr", "ros2msg", b"int8 y"), 1, b"")
-    copy.finish()
+    kinds = [("a/msg/A", "ros2msg"), ("b/msg/B", "ros2idl"), ("c/msg/C", ""), (TF, "ros2msg")]
+    channels = [Channel(f"/{kind}", kind, "cdr", encoding, b"int8 x") for kind, encoding in kinds]
+    write_all(SqliteCopy(path, "run.db3"), *((channel, 1, b"") for channel in channels))
     with closing(sqlite3.connect(path)) as file:
         found = file.execute("SELECT * FROM message_definitions ORDER BY id").fetchall()
-    assert found == [(1, "a/msg/A", "ros2msg", "int8 x", ""), (2, CDR.type, "ros2msg", "int8 y", TYPE_HASH)]
+    assert found == [(1, "a/msg/A", "ros2msg", "int8 x", ""), (2, CDR.type, "ros2msg", "int8 x", TYPE_HASH)]
 
 
 def test_a_bag_is_latching_where_transforms_are_static(tmp_path: Path) -> None:
     path = tmp_path / "run.bag"
-    copy = BagCopy(path, "run.bag")
-    for topic in ("/tf", "/tf_static"):
-        copy.write(Channel(topic, CDR.type, "cdr"), 1, PAYLOAD)
-    copy.finish()
+    topics = ("/tf", "/tf_static")
+    write_all(BagCopy(path, "run.bag"), *((Channel(topic, TF, "cdr"), 1, PAYLOAD) for topic in topics))
     with Reader(path) as bag:
         # As a publisher of ROS 1 says it: not at all, or 1.
         found = {each.topic: getattr(each.ext, "latching", "") for each in bag.connections}
@@ -470,10 +463,7 @@ def test_the_metadata_have_the_first_time_and_the_duration(
     tmp_path: Path, times: list[int], start: int, duration: int
 ) -> None:
     path = tmp_path / "run.db3"
-    copy = SqliteCopy(path, "run.db3")
-    for time in times:
-        copy.write(CDR, time, PAYLOAD)
-    copy.finish()
+    write_all(SqliteCopy(path, "run.db3"), *((CDR, time, PAYLOAD) for time in times))
     with closing(sqlite3.connect(path)) as file:
         ((text,),) = file.execute("SELECT metadata FROM metadata")
     metadata = json.loads(text)["rosbag2_bagfile_information"]
