@@ -23,7 +23,7 @@ from support.processes import OPEN_FILES, is_open
 from support.recorded import SMALL, Line, as_ros2, in_blocks, messages_in, without_unfinished, write_mcap
 from support.samples import moving, static
 
-from tfbus import InvalidTransformError, RecordingError
+from tfbus import InvalidTransformError, RecordingError, TransformStamped
 from tfbus.recording import RecordedTopic, convert, open_recording
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.recording import Choice, Selection, looks_like_transforms
@@ -55,30 +55,27 @@ def test_the_content_of_a_file_decides_its_format_not_its_name(tmp_path: Path, r
         assert unnamed == named
 
 
-def test_a_range_begins_with_the_newest_static_transform_of_each_frame_from_before(recording: Path) -> None:
-    first, second, third, fourth = messages_in(recording, 35, 50)
-    assert [message.received for message in (first, second)] == [35, 35]
-    # In the order in which they came last.
-    assert (first.batch, second.batch) == ((static("base", "camera", 1.0),), (static("base", "laser", 2.0),))
-    assert (third.received, third.batch) == (40, (moving("odom", "base", 40),))
-    assert (fourth.received, fourth.batch) == (50, (static("base", "laser", 3.0),))
+OLD_LASER, NEW_LASER, CAMERA = static("base", "laser", 1.0), static("base", "laser", 2.0), static("base", "camera", 1.0)
 
 
 @pytest.mark.parametrize(
-    ("since", "until", "times"),
+    ("since", "until", "before", "times"),
     [
-        (10, None, [10, 20, 30, 40, 50]),
-        # A static transform of each of two frames from before.
-        (11, None, [11, 11, 20, 30, 40, 50]),
-        (10 * SECOND, None, [10 * SECOND] * 2),
-        (None, 9, []),
-        (5, 3, []),
+        (10, None, [], [10, 20, 30, 40, 50]),
+        (11, None, [OLD_LASER, CAMERA], [20, 30, 40, 50]),
+        # In the order in which they came last.
+        (35, 50, [CAMERA, NEW_LASER], [40, 50]),
+        (10 * SECOND, None, [CAMERA, static("base", "laser", 3.0)], []),
+        (None, 9, [], []),
+        (5, 3, [], []),
     ],
 )
-def test_a_range_has_its_messages_and_each_static_transform_once(
-    recording: Path, since: int | None, until: int | None, times: list[int]
+def test_a_range_begins_with_the_newest_static_transform_of_each_frame_from_before(
+    recording: Path, since: int | None, until: int | None, before: list[TransformStamped], times: list[int]
 ) -> None:
-    assert [message.received for message in messages_in(recording, since, until)] == times
+    expected = [(since, (sample,)) for sample in before]
+    expected += [(received, tuple(samples)) for received, _, samples in LINES if received in times]
+    assert [(message.received, message.batch) for message in messages_in(recording, since, until)] == expected
 
 
 def test_good_transforms_come_with_the_errors_of_the_bad_ones(tmp_path: Path) -> None:

@@ -212,18 +212,6 @@ def test_a_chunk_that_claims_to_hold_those_behind_it_hides_none_of_them(path: Pa
     assert f"nothing can be read from byte {second} to byte {third}: a chunk claims {size:,} bytes" in lost[0]
 
 
-def test_a_chunk_that_claims_too_much_is_not_unfolded(path: Path) -> None:
-    data = bytearray(write_bag(path, compression=Writer.CompressionFormat.BZ2))
-    with path.open("rb") as file:
-        first = read_record(file, find_chunk(file, 13) or 0)
-    size = data.index(b"size=", first.offset) + 5
-    data[size : size + 4] = (300 * 2**20).to_bytes(4, "little")
-    path.write_bytes(data)
-    found, lost = read(path)
-    assert len(found) < len(EXPECTED)
-    assert "claims 314,572,800 bytes, and 268,435,456 is the bound" in lost[0]
-
-
 def test_an_index_is_used_up_to_its_bound(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = write_bag(path)
     size = len(data) - struct.unpack_from("<Q", data, index_place(data))[0]
