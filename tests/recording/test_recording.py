@@ -73,7 +73,7 @@ OLD_LASER, NEW_LASER, CAMERA = static("base", "laser", 1.0), static("base", "las
 def test_a_range_begins_with_the_newest_static_transform_of_each_frame_from_before(
     recording: Path, since: int | None, until: int | None, before: list[TransformStamped], times: list[int]
 ) -> None:
-    expected = [(since, (sample,)) for sample in before]
+    expected: list[tuple[int | None, tuple[TransformStamped, ...]]] = [(since, (sample,)) for sample in before]
     expected += [(received, tuple(samples)) for received, _, samples in LINES if received in times]
     assert [(message.received, message.batch) for message in messages_in(recording, since, until)] == expected
 

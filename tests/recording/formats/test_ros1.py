@@ -117,7 +117,7 @@ def chunks_in(data: bytes) -> list[int]:
 COMPRESSIONS = [None, *Writer.CompressionFormat]
 
 
-def index_place(data: bytes) -> int:
+def index_place(data: bytes | bytearray) -> int:
     """The place in the header of a bag at which is told where its index begins."""
     return data.index(b"index_pos=") + 10
 

@@ -52,14 +52,18 @@ def test_json_of_one_transform_and_of_many_is_read() -> None:
     assert parser_of(foxglove("json", "foxglove.FrameTransform"))(json.dumps(AS_JSON).encode()) == [ONE]
 
 
-MALFORMED = [{"timestamp": {"sec": 1.5, "nsec": 6}}, {"translation": {"x": "1", "y": 2.0, "z": 3}}, {"rotation": 3}]
+MALFORMED: list[dict[str, object]] = [
+    {"timestamp": {"sec": 1.5, "nsec": 6}},
+    {"translation": {"x": "1", "y": 2.0, "z": 3}},
+    {"rotation": 3},
+]
 
 
 @pytest.mark.parametrize(
     "text",
     [
         *(b"", b"[", b"[" * 100_000, b"3", b'{"transforms": 3}', b'{"transforms": [{}]}', b"\xff", b"null"),
-        *(json.dumps({"transforms": [AS_JSON | wrong]}).encode() for wrong in MALFORMED),
+        *(json.dumps({"transforms": [{**AS_JSON, **wrong}]}).encode() for wrong in MALFORMED),
     ],
     ids=lambda text: repr(text[:60]),
 )
