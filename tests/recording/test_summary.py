@@ -5,7 +5,7 @@ import pickle
 import struct
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -168,19 +168,6 @@ def test_the_newest_parent_of_a_frame_decides_what_closes_a_loop(
     assert summary.problems == problems == ({"cycle": loops} if loops else {})
     assert counted == [1] * len(lines)
     assert summary.messages == len(lines)
-
-
-def test_summarise_reads_the_messages_that_are_given() -> None:
-    with open_recording(SMALL) as recording:
-        seen = []
-
-        def watched() -> Iterator[RecordedMessage]:
-            for message in recording.messages():
-                seen.append(message.received)
-                yield message
-
-        assert summarise(recording, watched()) == summary_of(SMALL)
-    assert len(seen) == len(messages_in(SMALL))
 
 
 def test_a_summary_is_frozen_data(tmp_path: Path) -> None:
