@@ -151,7 +151,7 @@ async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(bus: Bus,
 
 async def test_a_flush_writes_all_that_is_pending_in_whatever_parts(bus: Bus, path: Path) -> None:
     async with Recorder(bus, path) as recorder:
-        # So many are written at once, and a quarter of them more.
+        # A slice has 4,096 samples; a quarter of that is left for a second one.
         for number in range(5_120):
             bus.publish(moving("map", "a", number))
         await recorder.flush()
@@ -273,7 +273,7 @@ async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_
 
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(record, bus)
-    # It hears of nothing any more.
+    # The recorder has left the bus.
     bus.publish(moving("map", "a", 1))
     (recorder,) = recorders
     assert offered(recorder.statistics()) == recorder.statistics().samples == 6_000
@@ -389,7 +389,7 @@ async def main():
             for stamp in range(1_000_000):
                 broadcaster.send("map", "base", Transform((1 / (stamp + 1), 0.0, 0.0)), at=stamp)
                 if stamp == 100 or stamp % 2_000 == 0:
-                    # Not to go on before the disk has it is not to ask for it: no flush.
+                    # The disk gets it in its own time: a flush would hurry it.
                     while recorder.statistics().samples <= stamp:
                         await anyio.sleep(0.01)
                     print(recorder.statistics().samples, flush=True)
