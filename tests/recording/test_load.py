@@ -205,13 +205,13 @@ def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(path: Path) 
     # The same instant again: the sample that comes later counts.
     lines.insert(1_500, (14_990, moving("a", "b", 14_990, -1.0)))
     # Beyond the bound, each along another axis, and each in another block.
-    for place, far in ((1_950, (1e13, 0.0, 0.0)), (1_600, (0.0, 1e13, 0.0)), (1_300, (0.0, 0.0, 1e13))):
+    for place, far in ((1_950, (3e3, 0.0, 0.0)), (1_600, (0.0, 3e3, 0.0)), (1_300, (0.0, 0.0, 3e3))):
         lines.insert(place, (10 * place - 10, TransformStamped("a", "b", 10 * place - 5, Transform(far))))
     with closing(McapOutput(str(path), overwrite=True)) as output:
         output.write([(received, (sample,)) for received, sample in lines])
         output.finish()
     problems: Counter[str] = Counter()
-    tree = load(path, problems=problems)
+    tree = load(path, problems=problems, max_translation=2_500.0)
     assert problems == {"not physical": 3}
     (edge,) = tree.edges()
     assert (edge.samples, edge.oldest, edge.newest) == (2_000, 0, 19_990)
