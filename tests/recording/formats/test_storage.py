@@ -5,11 +5,14 @@ import io
 import tracemalloc
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from random import Random
 
 import lz4.frame
 import pytest
 import zstandard
+from support.recorded import messages_in, write_mcap
+from support.samples import moving
 
 from tfbus.recording.formats import storage
 from tfbus.recording.formats.storage import (
@@ -48,6 +51,21 @@ def test_batches_are_bounded_by_number_and_by_bytes(monkeypatch: pytest.MonkeyPa
     # Nine bytes do not fill one of ten.
     stored = [(k, TF, bytes(size)) for k, size in enumerate((9, 1, 1))]
     assert [len(block) for block in batches(iter(stored))] == [2, 1]
+
+
+def test_chunks_that_overlap_beyond_the_bound_are_told_once_and_read_out_of_order(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(storage, "MAX_OVERLAPPING", 1_000)
+    # The first message of each chunk comes behind all others.
+    times = [k + 1_000 * (k % 5 == 0) for k in range(100)]
+    write_mcap(path, [(time, "/tf", [moving("map", "base", time)]) for time in times], chunk_size=500)
+    messages = messages_in(path)
+    told = [str(error) for message in messages for error in message.errors]
+    assert len(told) == 1
+    assert told[0].endswith("chunks of more than 1,000 bytes overlap: their messages are not in order")
+    received = [message.received for message in messages if message.batch]
+    assert sorted(received) == sorted(times) != received
 
 
 DATA = bytes(range(256)) * 256
