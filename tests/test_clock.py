@@ -1,3 +1,5 @@
+"""Simulated time, the clock of the machine, and ticks."""
+
 import math
 from collections.abc import Awaitable, Callable, Coroutine
 from fractions import Fraction

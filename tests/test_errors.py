@@ -1,3 +1,5 @@
+"""The texts, facts, copies and plain data of errors."""
+
 import builtins
 import copy
 import inspect

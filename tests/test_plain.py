@@ -1,3 +1,5 @@
+"""Plain data of dataclasses, numbers and arrays, and printable text."""
+
 import json
 import math
 from collections.abc import Mapping

@@ -1,3 +1,5 @@
+"""Stamps, durations, dates and their texts."""
+
 import copy
 import math
 import pickle

@@ -1,4 +1,4 @@
-""""""
+"""Simulated time for tests, transforms that are nearly equal, and registrations."""
 
 import anyio
 import pytest

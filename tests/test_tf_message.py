@@ -1,3 +1,5 @@
+"""Messages of tf, to and from bytes."""
+
 import copy
 import itertools
 import math

@@ -1,4 +1,4 @@
-""""""
+"""Waking a loop from threads, letting all tasks settle, and waiting for the ends of threads and task groups."""
 
 import asyncio
 import threading

@@ -1,21 +1,50 @@
-"""The table that all benchmarks fill, and our side of the cases."""
+"""The table that all benchmarks fill, the turns that their sides take, and our side of the cases."""
 
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib.metadata import PackageNotFoundError, version
 from statistics import median
+from time import perf_counter
 from typing import Any
 
 import cases
 import pytest
 from cases import AUTHORITY, Case, Vector
+from support.both_kernels import COMPILED, tfbus_on
 
 import tfbus
-from tfbus import TransformStamped
+from tfbus import TransformStamped, TransformTree
 
 Ask = Callable[[Case], tuple[float, Vector]]
 """Has a peer measure one round of a case."""
+Turn = Callable[[], float]
+"""Has one side do its work once: seconds for each call, stamp or sample."""
+
+ROUNDS = 25
+
+
+def take_turns(*sides: Turn, rounds: int = ROUNDS) -> list[list[float]]:
+    """The seconds of all rounds of each side; the sides take turns, because the speed of a shared machine drifts."""
+    together = [[side() for side in sides] for _ in range(rounds)]
+    return [[*seconds] for seconds in zip(*together, strict=True)]
+
+
+def timed(call: Callable[[], Any], count: int = 1) -> Turn:
+    def one_turn() -> float:
+        # The turn of another side has left other things in the caches.
+        call()
+        start = perf_counter()
+        call()
+        return (perf_counter() - start) / count
+
+    return one_turn
+
+
+def other_kernel() -> dict[str, Any]:
+    """The package on the kernel that this process does not run on, by the kernel's name; empty if it was not built."""
+    name = "python" if tfbus.kernel == "compiled" else "compiled"
+    return {name: tfbus_on(name)} if name == "python" or COMPILED is not None else {}
 
 
 class Table:
@@ -23,6 +52,7 @@ class Table:
 
     def __init__(self) -> None:
         self._lines: list[str] = []
+        self.add("", "tfbus", "peer", "ratio", "wanted")
 
     def add(self, label: str, ours: str, peer: str = "", ratio: str = "", wanted: str = "") -> None:
         self._lines.append(f"{label:41} {ours:>22}   {peer:36} {ratio:18} {wanted}".rstrip())
@@ -30,10 +60,20 @@ class Table:
     def compare(
         self, label: str, ours: list[float], name: str, peer: list[float], wanted: str = "", unit: str = "us"
     ) -> None:
-        """Add a line from the seconds a call of each round, ours and the peer's."""
+        """Add a line from the seconds of each round, ours and the peer's."""
         ratios = [mine / other for mine, other in zip(ours, peer, strict=True)]
         ratio = f"{median(ratios):.2f} ({min(ratios):.2f}-{max(ratios):.2f})"
         self.add(label, show(ours, unit), f"{name} {show(peer, unit)}", ratio, wanted)
+
+    def measure(
+        self, label: str, on: Callable[[Any], Turn], name: str, peer: Turn, wanted: str = "", unit: str = "us"
+    ) -> None:
+        """Measure our side, as it is `on` each kernel, and a peer."""
+        others = other_kernel()
+        ours, theirs, *rest = take_turns(on(tfbus), peer, *map(on, others.values()))
+        self.compare(label, ours, name, theirs, wanted, unit)
+        for kernel, rounds in zip(others, rest, strict=True):
+            self.compare(f"  on the {kernel} kernel", rounds, name, theirs, unit=unit)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_sep("=", "speed")
@@ -63,10 +103,28 @@ def version_of(package: str) -> str:
         return "not installed"
 
 
-def build(sample: cases.Sample, package: Any = tfbus) -> TransformStamped:
-    """A sample of ours; of another copy of the package, if one is given."""
-    transform = package.Transform(sample.translation, sample.rotation)
-    made: TransformStamped = package.TransformStamped(
-        sample.parent, sample.child, sample.stamp, transform, AUTHORITY, sample.static
-    )
-    return made
+def build(samples: Iterable[cases.Sample], package: Any = tfbus) -> list[TransformStamped]:
+    """Samples of ours; of another copy of the package, if one is given."""
+    stamped, transform = package.TransformStamped, package.Transform
+    return [
+        stamped(each.parent, each.child, each.stamp, transform(each.translation, each.rotation), AUTHORITY, each.static)
+        for each in samples
+    ]
+
+
+def tree_of(chain: str, package: Any = tfbus) -> TransformTree:
+    tree: TransformTree = package.TransformTree(keep=2.0 * cases.KEEP)
+    tree.insert_many(build(cases.history(chain), package))
+    return tree
+
+
+def edges(chain: str) -> str:
+    return f"{len(chain)} edge{'s' * (len(chain) > 1)}"
+
+
+def last_of(chain: str) -> str:
+    return f"f{len(chain) - 1}"
+
+
+def name_of(backend: tuple[str, dict[str, Any]]) -> str:
+    return "uvloop" if backend[1] else backend[0]

@@ -1,3 +1,5 @@
+"""A broadcaster's samples, its mistakes and the frames that it owns."""
+
 import math
 from collections.abc import Callable
 

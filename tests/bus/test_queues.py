@@ -1,4 +1,4 @@
-""""""
+"""Streams of batches, and the queues behind them."""
 
 import copy
 from collections.abc import Awaitable, Callable, Iterable

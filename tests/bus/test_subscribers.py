@@ -1,4 +1,4 @@
-""""""
+"""Callbacks for batches and removals, and the log, which tells each thing once."""
 
 import logging
 

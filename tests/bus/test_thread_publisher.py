@@ -1,3 +1,5 @@
+"""Publishing from threads, and what else threads may do with a bus."""
+
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager

@@ -1,4 +1,4 @@
-"""The fixtures of the benchmarks: a plugin, so that all files fill one table."""
+"""The fixtures of the benchmarks."""
 
 import json
 import os
@@ -13,25 +13,19 @@ from cases import Case, Vector
 SYSTEM_PYTHON = "/usr/bin/python3"
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    # A test without its peer is skipped before it measures anything.
-    config.addinivalue_line("filterwarnings", "ignore:Benchmark fixture was not used at all")
-
-
 @pytest.fixture(scope="session")
 def table(request: pytest.FixtureRequest) -> Table:
     table = Table()
-    table.add("", "tfbus", "peer", "ratio", "wanted")
     request.config.pluginmanager.register(table)
     return table
 
 
+# Each of the following is for one file, because processes that a file leaves are killed.
+
+
 @pytest.fixture(scope="module")
 def tf2() -> Iterator[Ask | str]:
-    """Has the real tf2 of ROS 1, in a process of its own, measure one round of a case; or says why there is none.
-
-    For one file, because processes that a file leaves are killed.
-    """
+    """Has the real tf2 of ROS 1, in a process of its own, measure one round of a case; or says why there is none."""
     yield from _peer(SYSTEM_PYTHON)
 
 
@@ -45,8 +39,7 @@ def _peer(python: str, *arguments: str) -> Iterator[Ask | str]:
     if not Path(python).exists():
         yield f"no {python}"
         return
-    script = Path(__file__).with_name("tf2_peer.py")
-    command = [python, str(script), *arguments]
+    command = [python, str(Path(__file__).with_name("tf2_peer.py")), *arguments]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         requests, replies = process.stdin, process.stdout
         assert requests is not None
