@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from support import strategies as some
@@ -206,16 +206,6 @@ def test_samples_have_the_given_type() -> None:
         marked.mark = "mine"
 
 
-def test_leading_slashes_are_removed_only_with_bare_names() -> None:
-    payload = message_of(Part(b"/map", b"//base"), Part(b"odom", b"arm"))
-    for _ in range(2):
-        bare = decode(payload, bare_names=True)
-        assert [(s.parent, s.child) for s in bare.samples if s] == [("map", "base"), ("odom", "arm")]
-        kept = decode(payload)
-        assert [sample is None for sample in kept.samples] == [True, False]
-        assert [error.reason for error in kept.errors] == ["frame name"]
-
-
 # Decoding what is bad, one transform at a time.
 
 
@@ -298,18 +288,12 @@ def test_each_transform_is_accepted_normalised_or_refused_as_by_the_classes(
     ("bad", "reason", "parent", "child"),
     [
         (Part(nanosec=SECOND), "stamp", "map", "base"),
-        (Part(nanosec=2**32 - 1), "stamp", "map", "base"),
         (Part(child=b"\xff"), "frame name", "map", None),
         (Part(parent=b"caf\xe9"), "frame name", None, "base"),
         (Part(child=b"\xed\xa0\x80"), "frame name", "map", None),
         (Part(child=b"a" * (MAX_NAME + 1)), "frame name", "map", None),
-        (Part(parent=b"/map"), "frame name", "/map", "base"),
         (Part(child=b""), "frame name", "map", ""),
-        (Part(child=b"map"), "self transform", "map", "map"),
         (Part(numbers=(0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 1.0)), "not finite", "map", "base"),
-        (Part(numbers=(0.0, 0.0, 0.0, 0.0, 0.0, -math.inf, 1.0)), "not finite", "map", "base"),
-        (Part(numbers=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), "zero quaternion", "map", "base"),
-        (Part(numbers=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.011)), "not a unit quaternion", "map", "base"),
     ],
 )
 def test_a_bad_transform_is_refused_with_its_facts_and_its_neighbours_are_not(
@@ -421,20 +405,14 @@ def check(payload: bytes) -> None:
             assert sample.replace() == sample
 
 
-@given(payload=st.binary(max_size=400))
-@example(payload=b"")
-def test_random_bytes_do_no_harm(payload: bytes) -> None:
-    check(payload)
-
-
-@given(
-    order=st.sampled_from((b"\0\0\0\0", b"\0\1\0\0")),
-    count=st.integers(0, 3),
-    rest=st.binary(max_size=400),
-    pad=st.integers(0, 300),
+HEADERS = st.sampled_from((b"\0\0\0\0", b"\0\1\0\0")).flatmap(
+    lambda order: st.integers(0, 3).map(lambda count: order + count.to_bytes(4, "little" if order[1] else "big"))
 )
-def test_random_bytes_behind_a_good_header_do_no_harm(order: bytes, count: int, rest: bytes, pad: int) -> None:
-    check(order + count.to_bytes(4, "little" if order[1] else "big") + rest + bytes(pad))
+
+
+@given(begin=st.just(b"") | HEADERS, rest=st.binary(max_size=400), pad=st.integers(0, 300))
+def test_random_bytes_do_no_harm(begin: bytes, rest: bytes, pad: int) -> None:
+    check(begin + rest + bytes(pad))
 
 
 @given(little_endian=st.booleans(), wanted=st.lists(parts(), min_size=1, max_size=4), data=st.data())

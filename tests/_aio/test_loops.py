@@ -25,21 +25,6 @@ PATIENCE = 30.0
 """Real seconds after which a test that hangs is given up."""
 
 
-class CountedWaker:
-    """A waker with the number of its calls, and an event for the next call."""
-
-    def __init__(self) -> None:
-        self.waker = LoopWaker(self._answer)
-        self.calls = 0
-        self.threads: set[int] = set()
-        self.called = anyio.Event()
-
-    def _answer(self) -> None:
-        self.calls += 1
-        self.threads.add(threading.get_ident())
-        self.called.set()
-
-
 async def test_a_callback_that_raises_is_logged_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
     answers: list[int] = []
     waker = LoopWaker(lambda: answers.append(1 // len(answers)))
@@ -53,40 +38,15 @@ async def test_a_callback_that_raises_is_logged_and_ends_nothing(caplog: pytest.
     assert answers == [0, 1]
 
 
-def test_a_wake_that_a_closed_loop_never_answered_makes_the_next_one_raise_until_the_waker_is_bound_again() -> None:
-    counted = CountedWaker()
-
-    async def connect() -> None:
-        counted.waker.bind()
-
-    for _ in range(2):
-        native = asyncio.new_event_loop()
-        native.run_until_complete(connect())
-        counted.waker.wake()
-        native.close()
-        for _ in range(2):
-            with pytest.raises(RuntimeError):
-                counted.waker.wake()
-        assert counted.calls == 0
-
-    async def answer() -> None:
-        counted.waker.bind()
-        counted.waker.wake()
-        await asyncio.wait_for(counted.called.wait(), PATIENCE)
-
-    asyncio.run(answer())
-    assert counted.calls == 1
-
-
 def test_waking_in_a_thread_while_the_loop_ends_raises(run: Run) -> None:
-    counted = CountedWaker()
+    waker = LoopWaker(list)
     begun = threading.Event()
     errors: list[Exception] = []
 
     def keep_waking() -> None:
         while not errors:
             try:
-                counted.waker.wake()
+                waker.wake()
             except RuntimeError as error:
                 errors.append(error)
             begun.set()
@@ -94,7 +54,7 @@ def test_waking_in_a_thread_while_the_loop_ends_raises(run: Run) -> None:
     thread = threading.Thread(target=keep_waking)
 
     async def serve() -> None:
-        counted.waker.bind()
+        waker.bind()
         thread.start()
         assert begun.wait(PATIENCE)
 

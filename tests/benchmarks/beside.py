@@ -66,14 +66,16 @@ class Table:
         self.add(label, show(ours, unit), f"{name} {show(peer, unit)}", ratio, wanted)
 
     def measure(
-        self, label: str, on: Callable[[Any], Turn], name: str, peer: Turn, wanted: str = "", unit: str = "us"
+        self, label: str, on: Callable[[Any], Turn], name: str, peer: Turn | None, wanted: str = "", unit: str = "us"
     ) -> None:
-        """Measure our side, as it is `on` each kernel, and a peer."""
-        others = other_kernel()
-        ours, theirs, *rest = take_turns(on(tfbus), peer, *map(on, others.values()))
-        self.compare(label, ours, name, theirs, wanted, unit)
-        for kernel, rounds in zip(others, rest, strict=True):
-            self.compare(f"  on the {kernel} kernel", rounds, name, theirs, unit=unit)
+        """Measure our side, as it is `on` each kernel, beside a peer if there is one."""
+        ours = {label: on(tfbus)} | {f"  on the {name} kernel": on(package) for name, package in other_kernel().items()}
+        rounds = take_turns(*ours.values(), *([peer] if peer else []))
+        for line, mine, goal in zip(ours, rounds, (wanted, ""), strict=False):
+            if peer:
+                self.compare(line, mine, name, rounds[-1], goal, unit)
+            else:
+                self.add(line, show(mine, unit), f"no {name}")
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_sep("=", "speed")

@@ -87,56 +87,34 @@ def lookup(case: Case, package: Any) -> Pass:
     return one_pass
 
 
-TF2_CASES = [
-    ("publish 1, built beforehand", Case("insert"), "<= 0.4"),
-    ("publish 1, stamped in the timing", Case("insert stamped"), "<= 1.0"),
-    ("publish 20, each", Case("insert batches"), "<= 1.0"),
-    ("lookup, 1 edge", Case("lookup", "m"), "<= 0.07"),
-    ("lookup, 3 edges", Case("lookup", "mmm"), "<= 0.08"),
-    ("lookup, 10 edges", Case("lookup", "mmmmmmmmmm"), "<= 0.15"),
-    ("lookup, 10 edges, 7 of them static", Case("lookup", "msssmsssms"), ""),
-    ("lookup LATEST, 1 edge", Case("lookup latest", "m"), ""),
-    ("lookup LATEST, 3 edges", Case("lookup latest", "mmm"), ""),
-    ("lookup LATEST, 10 edges", Case("lookup latest", "mmmmmmmmmm"), ""),
-]
-ROS_2_CASES = [
-    ("lookup in the newest 0.1 s, 10 edges", Case("lookup newest", "m" * 10), "<= 0.15"),
-    ("lookup LATEST, 10 edges", Case("lookup latest", "m" * 10), "<= 0.15"),
-    ("insert 1 into a tree", Case("insert into the tree"), "<= 0.4"),
-    ("publish 1, built beforehand", Case("insert"), "<= 0.4"),
-]
-
-
 def passes(case: Case, package: Any) -> Pass:
     return lookup(case, package) if case.chain else insert(case.kind, package)
 
 
-def beside(table: Table, tf2: Ask | str, label: str, case: Case, wanted: str) -> None:
-    """Measure a case on both kernels beside a tf2, or alone where there is none."""
-    if isinstance(tf2, str):
-        alone = passes(case, tfbus)
-        (ours,) = take_turns(lambda: alone()[0])
-        table.add(label, show(ours, "us"), "no tf2")
-        pytest.skip(tf2)
-
+@pytest.mark.parametrize(
+    ("label", "case", "wanted"),
+    [
+        ("publish 1, built beforehand", Case("insert"), "<= 0.4"),
+        ("publish 1, stamped in the timing", Case("insert stamped"), "<= 1.0"),
+        ("publish 20, each", Case("insert batches"), "<= 1.0"),
+        ("insert 1 into a tree", Case("insert into the tree"), "<= 0.4"),
+        ("lookup, 1 edge", Case("lookup", "m"), "<= 0.07"),
+        ("lookup, 3 edges", Case("lookup", "mmm"), "<= 0.08"),
+        ("lookup, 10 edges", Case("lookup", "m" * 10), "<= 0.15"),
+        ("lookup, 10 edges, 7 of them static", Case("lookup", "msssmsssms"), ""),
+        ("lookup in the newest 0.1 s, 10 edges", Case("lookup newest", "m" * 10), "<= 0.15"),
+        ("lookup LATEST, 1 edge", Case("lookup latest", "m"), ""),
+        ("lookup LATEST, 3 edges", Case("lookup latest", "mmm"), ""),
+        ("lookup LATEST, 10 edges", Case("lookup latest", "m" * 10), "<= 0.15"),
+    ],
+)
+def test_beside_tf2(table: Table, tf2: Ask | None, label: str, case: Case, wanted: str) -> None:
     def on(package: Any) -> Turn:
         one_pass = passes(case, package)
-        assert one_pass()[1] == pytest.approx(tf2(case)[1], abs=1e-6)
+        assert tf2 is None or one_pass()[1] == pytest.approx(tf2(case)[1], abs=1e-6)
         return lambda: one_pass()[0]
 
-    table.measure(label, on, "tf2", lambda: tf2(case)[0], wanted)
-
-
-@pytest.mark.parametrize(("label", "case", "wanted"), TF2_CASES)
-def test_beside_tf2(table: Table, tf2: Ask | str, label: str, case: Case, wanted: str) -> None:
-    if isinstance(tf2, str):
-        tf2 = f"no tf2 to measure beside ({tf2}); on Debian: apt-get install python3-tf2-ros"
-    beside(table, tf2, label, case, wanted)
-
-
-@pytest.mark.parametrize(("label", "case", "wanted"), ROS_2_CASES)
-def test_beside_tf2_of_ros_2(table: Table, tf2_of_ros_2: Ask | str, label: str, case: Case, wanted: str) -> None:
-    beside(table, tf2_of_ros_2, f"ROS 2: {label}", case, wanted)
+    table.measure(label, on, "tf2", None if tf2 is None else lambda: tf2(case)[0], wanted)
 
 
 def hundred_frames(package: Any, *, built: bool) -> Turn:

@@ -307,20 +307,25 @@ def test_bus_objects_may_be_made_before_a_loop_and_used_on_several_loops(run: Ru
     got: list[Batch] = []
     bus.subscribe(got.append)
     publisher = bus.threadsafe()
+    stream = bus.stream()
 
     async def wait_and_send() -> None:
         async with anyio.create_task_group() as tasks:
+            await anext(stream)
             asked = Asked(tasks, partial(buffer.lookup, "map", "a", clock.now() + 1))
+            reading = Asked(tasks, stream.__anext__)
             await clock.advance(1.0)
             broadcaster.send("map", "a", moving("map", "a", 1).transform)
             await settle()
             assert asked.answer.stamp == clock.now() - 999_999_999
+            assert [sample.stamp for sample in reading.answer] == [clock.now()]
+            broadcaster.send("map", "b", Transform())
 
     broadcaster.send("map", "a", moving("map", "a", 1).transform)
     for _ in range(3):
         run(wait_and_send)
     publisher.end()
-    assert len(got) == 4
+    assert len(got) == 7
 
 
 # Statistics and the long run
