@@ -18,6 +18,8 @@ from cases import BASE, MANY, PERIOD, START, Case
 
 from tfbus import SECOND, PointCloud, Transform, TransformStamped, do_transform
 
+pytest_plugins = ["side_by_side"]
+
 FEW_ROUNDS = 7
 """For calls that take pytransform3d up to a second."""
 POINTS = 100_000

@@ -22,6 +22,8 @@ from support.samples import moving, static
 from tfbus import Buffer, Bus
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink
 
+pytest_plugins = ["side_by_side"]
+
 ASKED = 1_000
 FRAMES, RATE, SECONDS = 50, 20.0, 10.0
 MANY = 100

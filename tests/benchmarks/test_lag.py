@@ -15,6 +15,8 @@ from beside import Table, name_of
 from tfbus import SECOND, Buffer, Bus, RecorderStatistics, Transform, TransformBroadcaster
 from tfbus.recording import Recorder
 
+pytest_plugins = ["side_by_side"]
+
 pytestmark = pytest.mark.every_loop
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]

@@ -16,6 +16,8 @@ from support.processes import Crowd, PeerProcess, crowd, free_address, new_domai
 from tfbus import Bus
 from tfbus.links.zenoh import ZenohLink
 
+pytest_plugins = ["side_by_side"]
+
 BACKENDS = ("asyncio", "asyncio+uvloop", "trio")
 SECONDS = 5.0
 SETTLE, RESTED = 30.0, 30.0

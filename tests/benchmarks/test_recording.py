@@ -20,6 +20,8 @@ from tfbus import Transform, TransformStamped
 from tfbus.recording import load
 from tfbus.tf_message import decode, encode
 
+pytest_plugins = ["side_by_side"]
+
 CALLS = 200
 MESSAGE = "tf2_msgs/msg/TFMessage"
 ROS = get_typestore(Stores.ROS2_JAZZY)

@@ -10,6 +10,8 @@ from support import pr2
 
 from tfbus import Buffer, Bus, RobotModel, RobotStatePublisher, SimulatedClock
 
+pytest_plugins = ["side_by_side"]
+
 ROUNDS = 15
 RATE = 100.0
 WANTED = 0.25

@@ -22,6 +22,8 @@ from cases import AUTHORITY, BASE, START, Case, Pass, Vector
 import tfbus
 from tfbus import Buffer, Bus, Transform, TransformStamped
 
+pytest_plugins = ["side_by_side"]
+
 FEW_ROUNDS = 5
 HUNDRED = 100
 A_SECOND = 100_000

@@ -3,7 +3,7 @@
 import logging
 import math
 import re
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -33,12 +33,22 @@ from tfbus.stamps import STAMP_MAX
 
 pytestmark = pytest.mark.anyio
 
+T = TypeVar("T")
+
 HOUR = 3600 * SECOND
 NOW = 100 * SECOND
 
 
 def bus_at(now: int = NOW, **options: Any) -> Bus:
     return Bus(SimulatedClock(now), **options)
+
+
+def told(kind: type[T], bus: Bus, *samples: TransformStamped) -> list[T]:
+    """The events of a kind that a new stream has, with those of samples that are then published one by one."""
+    with bus.events() as events:
+        for sample in samples:
+            bus.publish(sample)
+        return [event for event in iter(events.queue.get, None) if isinstance(event, kind)]
 
 
 # Translations
@@ -86,20 +96,15 @@ def test_every_answer_is_finite_for_a_long_chain_of_edges_at_the_greatest_bound(
 
 def test_a_stamp_ahead_of_the_clock_is_announced_logged_once_and_counted(caplog: pytest.LogCaptureFixture) -> None:
     bus = bus_at()
-    with bus.events() as events:
-        bus.publish(moving("map", "base", NOW + SECOND, authority="odometry"))
-        assert bus.statistics().ahead == 0
-        for k in range(3):
-            bus.publish(moving("map", "base", NOW + HOUR + k, authority="peer"))
-        found = [events.queue.get() for _ in range(len(events.queue))]
-    assert [event for event in found if isinstance(event, StampAhead)] == [StampAhead(NOW, "base", NOW + HOUR, "peer")]
+    assert told(StampAhead, bus, moving("map", "base", NOW + SECOND, authority="odometry")) == []
+    assert bus.statistics().ahead == 0
+    ahead = [moving("map", "base", NOW + HOUR + k, authority="peer") for k in range(3)]
+    assert told(StampAhead, bus, *ahead) == [StampAhead(NOW, "base", NOW + HOUR, "peer")]
     assert bus.statistics().ahead == 3
     assert [record.getMessage() for record in caplog.records if "ahead" in record.getMessage()] == [
         "frame 'base' has a sample from 'peer' that is 3600 s ahead of the clock: right samples are older, and expire"
     ]
-    with bus.events() as later:
-        found = [later.queue.get() for _ in range(len(later.queue))]
-    assert StampAhead(NOW, "base", NOW + HOUR + 2, "peer") in found
+    assert told(StampAhead, bus) == [StampAhead(NOW, "base", NOW + HOUR + 2, "peer")]
 
 
 @pytest.mark.parametrize("beyond", [0, 1])
@@ -108,13 +113,9 @@ def test_a_stamp_is_ahead_only_beyond_the_bound(beyond: int) -> None:
     buffer = Buffer(bus)
     bus.publish(moving("map", "base", NOW + 2 * SECOND + beyond))
     bus.publish(moving("map", "base", NOW - HOUR))
-    with bus.events() as events:
-        found = [events.queue.get() for _ in range(len(events.queue))]
     counted = bus.statistics()
     assert (counted.ahead, counted.buffers[0].expired, counted.buffers[0].expired_ahead) == (beyond, 1, beyond)
-    assert [event for event in found if isinstance(event, StampAhead)] == (
-        [StampAhead(NOW, "base", NOW + 2 * SECOND + 1, "")] if beyond else []
-    )
+    assert told(StampAhead, bus) == [StampAhead(NOW, "base", NOW + 2 * SECOND + 1, "")] * beyond
     with pytest.raises(PastExtrapolationError) as caught:
         buffer.lookup_nowait("map", "base", NOW - HOUR)
     assert caught.value.ahead == (2 * SECOND + 1) * beyond
@@ -146,7 +147,9 @@ def test_a_sample_that_is_late_by_less_than_a_window_is_silent_and_one_that_expi
     buffer = Buffer(bus)
     bus.publish([moving("map", "base", NOW), moving("map", "base", NOW - 10 * SECOND)])
     assert (bus.statistics().buffers[0].expired, caplog.records) == (0, [])
-    assert told(bus, moving("map", "base", NOW - 20 * SECOND)) == [StampBehind(NOW, "base", NOW - 20 * SECOND, NOW, "")]
+    assert told(StampBehind, bus, moving("map", "base", NOW - 20 * SECOND)) == [
+        StampBehind(NOW, "base", NOW - 20 * SECOND, NOW, "")
+    ]
     (counted,) = bus.statistics().buffers
     assert (counted.expired, counted.expired_ahead) == (1, 0)
     with pytest.raises(PastExtrapolationError) as caught:
@@ -173,11 +176,9 @@ def test_a_clock_of_the_machine_that_was_set_back_is_noticed_when_samples_expire
     bus = Bus(clock)
     Buffer(bus)
     bus.publish(moving("map", "base", NOW, authority="odometry"))
-    with bus.events() as events:
-        clock.step = -HOUR
-        bus.publish(moving("map", "base", NOW - HOUR, authority="odometry"))
-        found = [events.queue.get() for _ in range(len(events.queue))]
-    assert StampAhead(NOW - HOUR, "base", NOW, "odometry") in found
+    clock.step = -HOUR
+    late = moving("map", "base", NOW - HOUR, authority="odometry")
+    assert StampAhead(NOW - HOUR, "base", NOW, "odometry") in told(StampAhead, bus, late)
     assert bus.statistics().buffers[0].expired_ahead == 1
 
 
@@ -225,15 +226,6 @@ WALL = 1_795_560_204 * SECOND
 LATE = "it is late, or the clock of its sender is behind or stands still"
 
 
-def told(bus: Bus, *samples: TransformStamped) -> list[StampBehind]:
-    """The events of samples behind the clock that these samples make, published one by one."""
-    with bus.events() as events:
-        for sample in samples:
-            bus.publish(sample)
-        found = [events.queue.get() for _ in range(len(events.queue))]
-    return [event for event in found if isinstance(event, StampBehind)]
-
-
 @pytest.mark.parametrize("quiet", [True, False])
 @pytest.mark.parametrize(
     ("stamp", "words"),
@@ -257,7 +249,7 @@ def test_stamps_behind_the_clock_are_announced_logged_once_with_the_likely_cause
         for sample in late:
             bus.publish(sample)
     else:
-        assert told(bus, *late) == [StampBehind(WALL, "base", stamp, None, "driver")]
+        assert told(StampBehind, bus, *late) == [StampBehind(WALL, "base", stamp, None, "driver")]
     (counted,) = bus.statistics().buffers
     assert (bus.statistics().behind, counted.expired) == (5, 5)
     assert [record.getMessage() for record in caplog.records if "authorities" not in record.getMessage()] == [
@@ -280,11 +272,11 @@ async def test_a_clock_that_stands_still_and_a_message_that_comes_late_are_notic
     bus.publish(moving("map", "late", NOW))
     for _ in range(10):
         await clock.advance(1.0)
-        assert told(bus, moving("map", "stopped", NOW)) == []
+        assert told(StampBehind, bus, moving("map", "stopped", NOW)) == []
     await clock.advance(1.0)
-    assert [event.at for event in told(bus, moving("map", "stopped", NOW))] == [NOW]
+    assert [event.at for event in told(StampBehind, bus, moving("map", "stopped", NOW))] == [NOW]
     await clock.advance(180.0)
-    last = told(bus, moving("map", "late", NOW + 1))[-1]
+    last = told(StampBehind, bus, moving("map", "late", NOW + 1))[-1]
     assert (last.frame, last.at, bus.statistics().behind) == ("late", NOW + 1, 2)
 
 
@@ -292,8 +284,10 @@ def test_a_stream_of_events_that_is_opened_later_hears_of_what_is_still_behind()
     bus = bus_at()
     bus.publish([moving("map", "late", 0, authority="driver"), moving("map", "was late", 0)])
     bus.publish([moving("map", "late", 5, authority="driver"), moving("map", "was late", NOW)])
-    assert told(bus, moving("map", "late", 9, authority="driver")) == [StampBehind(NOW, "late", 5, None, "driver")]
-    assert told(bus, moving("map", "was late", 9, authority="other")) == [
+    assert told(StampBehind, bus, moving("map", "late", 9, authority="driver")) == [
+        StampBehind(NOW, "late", 5, None, "driver")
+    ]
+    assert told(StampBehind, bus, moving("map", "was late", 9, authority="other")) == [
         StampBehind(NOW, "late", 9, None, "driver"),
         StampBehind(NOW, "was late", 9, None, "other"),
     ]

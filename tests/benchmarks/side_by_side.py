@@ -1,4 +1,4 @@
-"""The fixtures of the benchmarks."""
+"""The fixtures of the benchmarks: a plugin, so that all files fill one table."""
 
 import json
 import os
