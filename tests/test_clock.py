@@ -153,32 +153,6 @@ async def test_sleep_until_ends_when_a_jump_passes_its_stamp() -> None:
         assert later.ended
 
 
-async def test_listeners_get_each_new_stamp_until_they_are_closed() -> None:
-    clock = SimulatedClock(start=SECOND)
-    stamps: list[int] = []
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(clock.sleep, 0.5)
-        with clock.on_move(stamps.append):
-            await clock.advance(0.0)
-            assert stamps == []
-            await clock.advance(1.0)
-            clock.set(SECOND)
-        clock.set(2 * SECOND)
-    assert stamps == [3 * SECOND // 2, 2 * SECOND, SECOND]
-
-
-async def test_jump_callbacks_get_both_stamps_until_they_are_closed() -> None:
-    clock = SimulatedClock(start=5)
-    jumps: list[tuple[int, int]] = []
-    registration = clock.on_jump(lambda before, after: jumps.append((before, after)))
-    clock.set(9)
-    clock.set(2)
-    await clock.advance(1.0)
-    registration.close()
-    clock.set(0)
-    assert jumps == [(5, 9), (9, 2)]
-
-
 async def test_move_on_after_counts_simulated_time_across_jumps() -> None:
     clock = SimulatedClock()
 
@@ -449,3 +423,20 @@ async def test_of_two_jumps_in_one_turn_the_first_decides_for_a_sleeper() -> Non
             assert (asked.error.before, asked.error.after) == (10 * SECOND, 0)
         else:
             assert asked.error is None
+
+
+async def test_listeners_get_each_new_stamp_and_both_stamps_of_a_jump_until_they_are_closed() -> None:
+    clock = SimulatedClock(start=SECOND)
+    stamps: list[int] = []
+    jumps: list[tuple[int, int]] = []
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(clock.sleep, 0.5)
+        with clock.on_move(stamps.append), clock.on_jump(lambda before, after: jumps.append((before, after))):
+            await clock.advance(0.0)
+            assert stamps == []
+            await clock.advance(1.0)
+            clock.set(SECOND)
+            clock.set(9 * SECOND)
+        clock.set(2 * SECOND)
+    assert stamps == [3 * SECOND // 2, 2 * SECOND, SECOND, 9 * SECOND]
+    assert jumps == [(2 * SECOND, SECOND), (SECOND, 9 * SECOND)]

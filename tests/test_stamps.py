@@ -189,9 +189,6 @@ DATES = [
     pytest.param(np.datetime64(-1, "ps"), -1, id="ps"),
     pytest.param(np.datetime64(1_999_999, "fs"), 1, id="fs"),
     pytest.param(np.datetime64(2 * SECOND, "as"), 2, id="as"),
-    pytest.param(np.datetime64(1_999, "ps"), 1, id="almost 2000 ps"),
-    pytest.param(np.datetime64(2_000, "ps"), 2, id="2000 ps"),
-    pytest.param(np.datetime64(2_000_000, "fs"), 2, id="2000000 fs"),
     pytest.param(np.datetime64("2262-04"), 9_222_422_400 * SECOND, id="last month"),
     pytest.param(np.datetime64("1677-10"), -106_742 * DAY, id="first month"),
     # 1972 to 2260 are 73 leap years but for 2100 and 2200; 1680 to 1968 but for 1700, 1800 and 1900.
@@ -233,11 +230,8 @@ def test_the_last_date_of_each_unit_is_a_stamp_and_the_next_is_beyond_64_bits(un
         (np.datetime64("NaT", "ns"), "not NaT"),
         (np.datetime64("2262-05"), "64-bit"),
         (np.datetime64("1677-09-21T00:12:43"), "64-bit"),
-        (np.datetime64("2263"), "64-bit"),
         (np.datetime64("9999-01"), r"'9999-01'.* 64-bit"),
-        (np.datetime64("9999"), r"'9999'.* 64-bit"),
         (np.datetime64(2**62, "Y"), "64-bit"),
-        (np.datetime64(-(2**62), "us"), "64-bit"),
         (np.datetime64(1, (b"W", 2**31 - 1)), "64-bit"),
     ],
 )

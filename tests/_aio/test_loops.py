@@ -79,22 +79,6 @@ class Log:
         self.ended += 1
 
 
-async def events(hops: int, log: Log) -> None:
-    """Each of many tasks waits for the one before it."""
-    async with anyio.create_task_group() as tasks:
-        chain = [anyio.Event() for _ in range(hops + 1)]
-
-        async def pass_on(hop: int) -> None:
-            await chain[hop].wait()
-            chain[hop + 1].set()
-
-        for hop in range(hops):
-            tasks.start_soon(pass_on, hop)
-        chain[0].set()
-        await chain[-1].wait()
-    log.end()
-
-
 async def nested_task_groups(hops: int, log: Log) -> None:
     if hops:
         async with anyio.create_task_group() as tasks:
@@ -110,7 +94,7 @@ async def checkpoints(hops: int, log: Log) -> None:
 
 
 @pytest.mark.parametrize("hops", [1, 2, 100])
-@pytest.mark.parametrize("chain", [events, nested_task_groups, checkpoints])
+@pytest.mark.parametrize("chain", [nested_task_groups, checkpoints])
 async def test_a_chain_has_ended_before_settling_ends(
     chain: Callable[[int, Log], Coroutine[Any, Any, None]], hops: int
 ) -> None:

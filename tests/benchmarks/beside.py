@@ -3,7 +3,7 @@
 import os
 import platform
 from collections.abc import Callable, Iterable
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from statistics import median
 from time import perf_counter
 from typing import Any
@@ -92,17 +92,11 @@ def show(rounds: list[float], unit: str) -> str:
 
 def conditions() -> str:
     """The versions and the machine that the times depend on."""
-    packages = [f"{name} {version_of(name)}" for name in ("numpy", "transform-tree", "pytransform3d")]
+    found = {each.name.replace("_", "-"): each.version for each in distributions()}
+    versions = [f"{name} {found.get(name, 'not installed')}" for name in ("numpy", "transform-tree", "pytransform3d")]
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "not set")
     machine = f"{os.cpu_count()} cores ({platform.machine()}), OPENBLAS_NUM_THREADS {threads}"
-    return f"Python {platform.python_version()}, {', '.join(packages)}; {machine}"
-
-
-def version_of(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
+    return f"Python {platform.python_version()}, {', '.join(versions)}; {machine}"
 
 
 def build(samples: Iterable[cases.Sample], package: Any = tfbus) -> list[TransformStamped]:

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -37,15 +38,6 @@ def repeated(call: Callable[[], object]) -> Turn:
     return timed(lambda: [call() for _ in range(CALLS)], CALLS)
 
 
-def test_encoding(table: Table) -> None:
-    samples = robot()
-    payload = encode(samples)
-    message = ROS.deserialize_cdr(payload, MESSAGE)
-    assert bytes(ROS.serialize_cdr(message, MESSAGE)) == payload
-    ours, theirs = take_turns(repeated(lambda: encode(samples)), repeated(lambda: ROS.serialize_cdr(message, MESSAGE)))
-    table.compare("encode 20 transforms", ours, "rosbags", theirs, "<= 20 us")
-
-
 def rounded(payload: bytes) -> bytes:
     """The message as somebody sends it who has single precision."""
     message = ROS.deserialize_cdr(payload, MESSAGE)
@@ -56,28 +48,21 @@ def rounded(payload: bytes) -> bytes:
     return bytes(ROS.serialize_cdr(message, MESSAGE))
 
 
-@pytest.mark.parametrize(
-    ("label", "precise", "little_endian"),
-    [
-        ("decode 20 transforms", True, True),
-        ("decode 20 transforms, to normalise", False, True),
-        ("decode 20 transforms, big endian", True, False),
-    ],
-)
-def test_decoding(table: Table, label: str, precise: bool, little_endian: bool) -> None:
+def test_messages(table: Table) -> None:
     samples = robot()
-    payload = encode(samples) if precise else rounded(encode(samples))
     tags = [(sample.authority, sample.static) for sample in samples]
-    if not little_endian:
-        message = ROS.deserialize_cdr(payload, MESSAGE)
-        payload = bytes(ROS.serialize_cdr(message, MESSAGE, little_endian=False))
-    decoded = decode(payload, tags).samples
-    if precise:
-        assert decoded == samples
-    ours, theirs = take_turns(
-        repeated(lambda: decode(payload, tags)), repeated(lambda: ROS.deserialize_cdr(payload, MESSAGE))
-    )
-    table.compare(label, ours, "rosbags", theirs, "<= 40 us")
+    payload = encode(samples)
+    message = ROS.deserialize_cdr(payload, MESSAGE)
+    assert bytes(ROS.serialize_cdr(message, MESSAGE)) == payload
+    assert decode(payload, tags).samples == samples
+    big_endian = bytes(ROS.serialize_cdr(message, MESSAGE, little_endian=False))
+    ours, theirs = take_turns(repeated(lambda: encode(samples)), repeated(lambda: ROS.serialize_cdr(message, MESSAGE)))
+    table.compare("encode 20 transforms", ours, "rosbags", theirs, "<= 20 us")
+    for kind, data in (("", payload), (", to normalise", rounded(payload)), (", big endian", big_endian)):
+        ours, theirs = take_turns(
+            repeated(partial(decode, data, tags)), repeated(partial(ROS.deserialize_cdr, data, MESSAGE))
+        )
+        table.compare(f"decode 20 transforms{kind}", ours, "rosbags", theirs, "<= 40 us")
 
 
 # Recordings

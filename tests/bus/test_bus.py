@@ -275,7 +275,6 @@ CALLS: list[Callable[[Bus], object]] = [
     lambda bus: bus.remove_frame("s"),
     lambda bus: bus.subscribe(print),
     lambda bus: bus.stream(),
-    lambda bus: bus.threadsafe(),
     lambda bus: bus.events(),
     lambda bus: bus.reserve("map", authority="slam"),
     lambda bus: Buffer(bus),
@@ -283,7 +282,7 @@ CALLS: list[Callable[[Bus], object]] = [
 ]
 
 
-@pytest.mark.parametrize("call", CALLS)
+@pytest.mark.parametrize("call", [*CALLS, Bus.threadsafe])
 def test_a_closed_bus_refuses_samples_and_registrations(
     call: Callable[[Bus], object], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -411,23 +410,11 @@ async def test_frames_that_come_and_go_keep_memory_flat(caplog: pytest.LogCaptur
 async def test_every_call_but_threadsafe_from_another_thread_is_an_error_while_a_loop_runs() -> None:
     clock = SimulatedClock(start=10)
     with Bus(clock) as bus, Buffer(bus) as buffer:
-        bus.publish(moving("map", "base", 0))
-        touches: list[Callable[[], object]] = [
-            partial(bus.publish, moving("map", "other", 0)),
-            partial(bus.publish, moving("map", "base", 1), invalid="drop"),
-            bus.events,
-            partial(bus.reserve, "arm", "driver"),
-            partial(buffer.watch, "map", "base"),
-            partial(Buffer, bus),
-            partial(bus.subscribe, print),
-            bus.stream,
-            partial(bus.remove_frame, "base"),
-            partial(clock.set, 0),
-        ]
-        for touch in touches:
+        bus.publish([moving("map", "base", 0), static("map", "s")])
+        for touch in (*CALLS, lambda _: buffer.watch("map", "base"), lambda _: clock.set(0)):
             with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
-                await anyio.to_thread.run_sync(touch)
-        assert bus.statistics().frames == 1
+                await anyio.to_thread.run_sync(touch, bus)
+        assert bus.statistics().frames == 2
         assert not bus.closed
         assert await buffer.lookup("map", "base", 0)
 

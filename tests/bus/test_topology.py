@@ -328,14 +328,6 @@ def test_the_errors_of_a_lookup_between_two_clocks_say_so() -> None:
         tree.lookup("map", "base", 3617)
 
 
-@pytest.mark.parametrize("clock", [SimulatedClock(), SystemClock()])
-def test_a_clock_that_nobody_has_set_and_a_bus_without_a_bound_have_no_stamp_ahead(clock: Any) -> None:
-    bus = Bus(clock) if isinstance(clock, SimulatedClock) else Bus(clock, max_ahead=None)
-    for k in range(3):
-        bus.publish(moving("map", "base", STAMP_MAX - 10 + k))
-    assert bus.statistics().ahead == 0
-
-
 def test_the_log_line_and_the_error_of_a_stamp_years_ahead_name_the_likely_cause(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -370,6 +362,20 @@ def test_a_static_sample_is_never_ahead(caplog: pytest.LogCaptureFixture) -> Non
 
 
 @pytest.mark.parametrize(
+    ("clock", "options"),
+    [(SimulatedClock(), {}), (SystemClock(), {"max_ahead": None}), (SimulatedClock(WALL), {"max_behind": None})],
+)
+def test_a_clock_that_nobody_has_set_and_a_bus_without_a_bound_have_no_stamp_ahead_or_behind(
+    caplog: pytest.LogCaptureFixture, clock: SystemClock, options: Any
+) -> None:
+    bus = Bus(clock, **options)
+    stamps = [WALL, 0, 1] if "max_behind" in options else [STAMP_MAX - 10 + k for k in range(3)]
+    for stamp in stamps:
+        bus.publish(moving("map", f"base {stamp}", stamp))
+    assert (caplog.records, bus.statistics().ahead, bus.statistics().behind) == ([], 0, 0)
+
+
+@pytest.mark.parametrize(
     ("options", "kind"),
     [
         ({"max_ahead": -1.0}, ValueError),
@@ -383,10 +389,3 @@ def test_a_static_sample_is_never_ahead(caplog: pytest.LogCaptureFixture) -> Non
 def test_bounds_that_make_no_sense_are_errors(options: Any, kind: type[Exception]) -> None:
     with pytest.raises(kind):
         Bus(SimulatedClock(), **options)
-
-
-def test_a_bus_without_a_bound_tells_of_none_behind(caplog: pytest.LogCaptureFixture) -> None:
-    bus = bus_at(WALL, max_behind=None)
-    Buffer(bus)
-    bus.publish([moving("map", "a", WALL), moving("map", "b", 0), moving("map", "a", 0)])
-    assert (caplog.records, bus.statistics().behind) == ([], 0)
