@@ -120,12 +120,16 @@ async def test_the_end_of_the_with_publishes_the_queued_samples() -> None:
     assert bus.statistics().queues == ()
 
 
-async def test_publishing_after_the_end_of_the_with_raises_in_the_thread() -> None:
+async def test_publishing_outside_of_the_with_raises_in_the_thread() -> None:
     bus = Bus()
-    with bus.threadsafe() as publish:
+    publish = bus.threadsafe()
+    (early,) = in_thread(lambda: publish(moving("map", "a", 1)))
+    assert isinstance(early, RuntimeError)
+    assert "with" in str(early)
+    with publish:
         pass
-    (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
-    assert isinstance(error, BusClosedError)
+    (late,) = in_thread(lambda: publish(moving("map", "a", 1)))
+    assert isinstance(late, BusClosedError)
     assert bus.statistics().samples == 0
 
 
@@ -136,25 +140,13 @@ def test_publishing_after_the_end_of_the_loop_raises(run: Run) -> None:
     async def leave_without_a_word() -> None:
         publishers.append(bus.threadsafe().__enter__())
 
+    with pytest.raises(RuntimeError), bus.threadsafe():
+        pytest.fail("there is no event loop yet")
     run(leave_without_a_word)
     for _ in range(2):
         (error,) = in_thread(lambda: publishers[0](moving("map", "a", 1)))
         assert isinstance(error, BusClosedError)
         assert len(publishers[0].queue) == 1, "after the first error it takes no more"
-
-
-async def test_publishing_before_the_with_raises() -> None:
-    bus = Bus()
-    publish = bus.threadsafe()
-    (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
-    assert isinstance(error, RuntimeError)
-    assert "with" in str(error)
-
-
-def test_the_with_is_entered_on_an_event_loop_only() -> None:
-    bus = Bus()
-    with pytest.raises(RuntimeError), bus.threadsafe():
-        pass
 
 
 async def test_samples_that_close_a_loop_are_dropped_and_counted_on_the_bus() -> None:
