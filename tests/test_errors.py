@@ -194,6 +194,10 @@ def test_a_message_has_the_question_the_facts_and_the_difference(error: Transfor
             "frame 'base_link': asked for 12.500 s, it has no samples",
         ),
         (
+            PastExtrapolationError(child="base_link", stamp=from_seconds(12.5), oldest=None, newest=None),
+            "frame 'base_link': asked for 12.500 s, it has no samples",
+        ),
+        (
             AheadError(child="base_link", stamp=from_seconds(12.5), oldest=None, newest=None),
             "frame 'base_link': asked for the latest up to 12.500 s, it has no samples",
         ),

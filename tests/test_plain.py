@@ -84,6 +84,7 @@ def test_the_first_alternative_that_can_be_read_holds() -> None:
         ({"at": True}, "Outer.at cannot be True"),
         ({"share": "0.5"}, "Outer.share cannot be '0.5'"),
         ({"flag": 1}, "Outer.flag cannot be 1"),
+        ({"parts": {}}, "Outer.parts cannot be {}"),
         ({"parts": [5]}, r"Outer.parts\[0\] cannot be 5"),
         ({"parts": [{"count": 1}, {"count": "1"}]}, r"Outer.parts\[1\] .*Inner.count cannot be '1'"),
         ({"pair": ["x", 1, 2]}, "Outer.pair cannot be"),

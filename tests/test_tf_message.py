@@ -172,12 +172,13 @@ def test_options_of_the_header_paddings_and_a_buffer_around_it_do_not_change_a_m
     samples = [moving("map", "base", 7)]
     payload = encode(samples)
     within = payload.index(b"base\0") + 5
-    for same in (
+    same_messages: tuple[bytes | memoryview, ...] = (
         payload[:2] + b"\xff\x03" + payload[4:],
         payload[:within] + b"\xff\xfe\xfd" + payload[within + 3 :],
         memoryview(b"xyz" + payload + b"xyz")[3:-3],
         *(payload + bytes(zeros) for zeros in range(4)),
-    ):
+    )
+    for same in same_messages:
         assert decode(same).samples == samples
     assert [decode(encode([]) + bytes(zeros)).samples for zeros in range(4)] == [[]] * 4
 

@@ -1,5 +1,6 @@
 """Publishing from threads, and what else threads may do with a bus."""
 
+import asyncio
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
@@ -299,3 +300,18 @@ async def test_a_closed_bus_takes_no_sample_of_a_thread_be_it_queued_or_new() ->
     assert bus.statistics().samples == 0
     with pytest.raises(BusClosedError):
         bus.threadsafe()
+
+
+def test_publishing_raises_once_the_loop_has_been_closed_without_an_answer_to_the_last_sample() -> None:
+    bus = Bus()
+    loop = asyncio.new_event_loop()
+
+    async def enter() -> ThreadPublisher:
+        return bus.threadsafe().__enter__()
+
+    publish = loop.run_until_complete(enter())
+    publish(moving("map", "a", 1))
+    loop.close()
+    for stamp in (2, 3):
+        with pytest.raises(BusClosedError):
+            publish(moving("map", "a", stamp))
