@@ -548,12 +548,22 @@ MAKING_ROOM = [
     Burst((), (Remove("a"), Publish((STRANGERS, STRANGERS, OWNERS), True), Remove("a")), 0.0),
     Burst((), (Publish((STRANGERS,), False), Publish((OWNERS, STRANGERS), False), Publish((OWNERS,), True)), 1.5),
 ]
+# Two authorities quarrel over a parent and a kind; each claim is told once, until the frame is removed.
+CLAIMS = tuple(
+    Publish((Draft((parent, "b"), 0, authority, static, False),), True)
+    for parent, authority, static in (("r", "slam", False), ("a", "odometry", False), ("r", "slam", True))
+)
+# A frame that is heard again in time does not turn stale, and then does.
+HEARD = [*[Burst((), (Publish((STRANGERS,), True),), 0.5)] * 3, Burst((), (), 4.0)]
+QUARREL = [Burst((), CLAIMS * 3, 0.5), Burst((), (Remove("b"), *CLAIMS, Jump(-1), *CLAIMS * 2), 4.0)]
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @example(on_conflict="last", bursts=MAKING_ROOM)
+@example(on_conflict="last", bursts=QUARREL)
+@example(on_conflict="last", bursts=HEARD)
+@example(on_conflict="reject", bursts=QUARREL)
 @given(on_conflict=st.sampled_from(["last", "reject"]), bursts=st.lists(BURSTS, min_size=2, max_size=10))
-@pytest.mark.thorough
 def test_every_reader_reads_exactly_what_the_model_says(run: Run, on_conflict: OnConflict, bursts: list[Burst]) -> None:
     async def play() -> None:
         async with anyio.create_task_group() as tasks:
