@@ -5,7 +5,6 @@ import logging
 import pickle
 import random
 import sys
-import threading
 import tracemalloc
 from itertools import pairwise
 from typing import Any
