@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import anyio
 import pytest
@@ -52,8 +53,7 @@ CRASHES = Transform((9.0, 0.0, 0.0))
 # What can happen; ages and durations in s
 
 
-@dataclass(frozen=True)
-class Draft:
+class Draft(NamedTuple):
     """A sample that is stamped when it is sent."""
 
     ends: tuple[str, str]
@@ -68,48 +68,15 @@ class Draft:
         return TransformStamped(parent, child, now - self.age * SECOND, transform, self.authority, self.static)
 
 
-@dataclass(frozen=True)
-class Publish:
-    drafts: tuple[Draft, ...]
-    drop: bool
+Happening = tuple[Any, ...]
+"""The name of a method of `Game`, and its arguments."""
 
 
-@dataclass(frozen=True)
-class Remove:
-    frame: str
-
-
-@dataclass(frozen=True)
-class Reserve:
-    frame: str
-    authority: str
-
-
-@dataclass(frozen=True)
-class Release:
-    place: int
-
-
-@dataclass(frozen=True)
-class Jump:
-    by: int
-
-
-@dataclass(frozen=True)
-class Join:
-    capacity: int
-    stale_after: int | None
-
-
-Happening = Publish | Remove | Reserve | Release | Jump | Join
-
-
-@dataclass(frozen=True)
-class Burst:
+class Burst(NamedTuple):
     """`toggled` are the places of the readers that stop reading or begin again."""
 
     toggled: tuple[int, ...]
-    happenings: tuple[Happening, ...]
+    happenings: list[Happening]
     then: float
 
 
@@ -388,32 +355,30 @@ class Game:
         self.reading: list[anyio.CancelScope | None] = []
         self.registrations: list[Registration] = []
 
-    def happen(self, happening: Happening) -> None:
-        now, model = self.clock.now(), self.model
-        if isinstance(happening, Publish):
-            batch = [draft.stamped(now) for draft in happening.drafts]
-            refused = model.publish(batch, happening.drop, now)
-            with pytest.raises(InvalidTransformError) if refused else nullcontext():
-                self.bus.publish(batch, invalid="drop" if happening.drop else "raise")
-        elif isinstance(happening, Remove):
-            with suppress(UnknownFrameError):
-                self.bus.remove_frame(happening.frame)
-            model.remove(happening.frame, now)
-        elif isinstance(happening, Reserve):
-            if model.owner(happening.frame) in (None, happening.authority):
-                self.registrations.append(self.bus.reserve(happening.frame, authority=happening.authority))
-                model.reserved.append((happening.frame, happening.authority))
-            else:
-                with pytest.raises(InvalidTransformError):
-                    self.bus.reserve(happening.frame, authority=happening.authority)
-        elif isinstance(happening, Release) and model.reserved:
-            place = happening.place % len(model.reserved)
-            self.registrations.pop(place).close()
-            model.reserved.pop(place)
-        elif isinstance(happening, Jump):
-            self.jump(happening.by * SECOND)
-        elif isinstance(happening, Join):
-            self.join(happening)
+    def publish(self, drafts: list[Draft], drop: bool) -> None:
+        now = self.clock.now()
+        batch = [draft.stamped(now) for draft in drafts]
+        refused = self.model.publish(batch, drop, now)
+        with pytest.raises(InvalidTransformError) if refused else nullcontext():
+            self.bus.publish(batch, invalid="drop" if drop else "raise")
+
+    def remove(self, frame: str) -> None:
+        with suppress(UnknownFrameError):
+            self.bus.remove_frame(frame)
+        self.model.remove(frame, self.clock.now())
+
+    def reserve(self, frame: str, authority: str) -> None:
+        if self.model.owner(frame) in (None, authority):
+            self.registrations.append(self.bus.reserve(frame, authority=authority))
+            self.model.reserved.append((frame, authority))
+        else:
+            with pytest.raises(InvalidTransformError):
+                self.bus.reserve(frame, authority=authority)
+
+    def release(self, place: int) -> None:
+        if self.registrations:
+            self.registrations.pop(place % len(self.registrations)).close()
+            self.model.reserved.pop(place % len(self.model.reserved))
 
     def toggle(self, place: int) -> None:
         scope = self.reading[place]
@@ -423,8 +388,8 @@ class Game:
             scope.cancel()
             self.reading[place] = None
 
-    def jump(self, by: int) -> None:
-        before = self.clock.now()
+    def jump(self, seconds: int) -> None:
+        before, by = self.clock.now(), seconds * SECOND
         self.clock.set(before + by)
         if by < 0:
             self.model.counted["resets"] += 1
@@ -432,14 +397,14 @@ class Game:
             self.model.edges = {child: edge for child, edge in self.model.edges.items() if edge.static}
             self.model.tell(ClockReset(before + by, before))
 
-    def join(self, joining: Join) -> None:
+    def join(self, capacity: int, stale_after: int | None) -> None:
         now = self.clock.now()
         known: list[Event] = [
             FrameAdded(now, child, edge.parent, edge.publisher, edge.static) for child, edge in self.model.edges.items()
         ]
-        limit = math.inf if joining.stale_after is None else joining.stale_after * SECOND
-        self.model.readers.append(Reader(joining.capacity, limit, known, len(known)))
-        self.streams.append(self.bus.events(joining.capacity, joining.stale_after))
+        limit = math.inf if stale_after is None else stale_after * SECOND
+        self.model.readers.append(Reader(capacity, limit, known, len(known)))
+        self.streams.append(self.bus.events(capacity, stale_after))
         self.read.append([])
         self.reading.append(None)
         self.start(len(self.streams) - 1)
@@ -460,7 +425,7 @@ class Game:
                 self.toggle(place % len(self.streams))
             await self.pass_time(0)
             for happening in burst.happenings:
-                self.happen(happening)
+                getattr(self, happening[0])(*happening[1:])
             await self.pass_time(0)
             await self.pass_time(round(burst.then * SECOND))
         for place, scope in enumerate(self.reading):
@@ -522,31 +487,38 @@ DRAFTS = st.builds(
     st.sampled_from([False, False, True]),
     st.sampled_from([False, False, False, True]),
 )
-PUBLISHES = st.builds(Publish, st.lists(DRAFTS, min_size=1, max_size=3).map(tuple), st.booleans())
+PUBLISHES = st.tuples(st.just("publish"), st.lists(DRAFTS, min_size=1, max_size=3), st.booleans())
 HAPPENINGS: st.SearchStrategy[Happening] = st.one_of(
     *[PUBLISHES] * 6,
-    st.builds(Remove, st.sampled_from(FRAMES)),
-    st.builds(Reserve, st.sampled_from(FRAMES), st.sampled_from(AUTHORITIES)),
-    st.builds(Release, st.integers(0, 3)),
-    st.builds(Jump, st.integers(-4, 4)) | PUBLISHES,
-    st.builds(Join, st.integers(1, 5), st.sampled_from([None, 0, 1, 2])) | PUBLISHES,
+    st.tuples(st.just("remove"), st.sampled_from(FRAMES)),
+    st.tuples(st.just("reserve"), st.sampled_from(FRAMES), st.sampled_from(AUTHORITIES)),
+    st.tuples(st.just("release"), st.integers(0, 3)),
+    st.tuples(st.just("jump"), st.integers(-4, 4)) | PUBLISHES,
+    st.tuples(st.just("join"), st.integers(1, 5), st.sampled_from([None, 0, 1, 2])) | PUBLISHES,
 )
 BURSTS = st.builds(
     Burst,
     st.sampled_from([(), (), (), (0,), (1,), (2,)]),
-    st.lists(HAPPENINGS, min_size=2, max_size=6).map(tuple),
+    st.lists(HAPPENINGS, min_size=2, max_size=6),
     st.sampled_from([0.0, 0.5, 1.5, 4.0]),
 )
 
 
 STRANGERS = Draft(("a", "b"), 0, "odometry", False, False)
 OWNERS = Draft(("b", "a"), 0, "slam", False, False)
-RESERVED = Reserve("a", "slam")
+RESERVED = ("reserve", "a", "slam")
 # What is rare: a stranger's edge goes to make room, from the bus or from a batch.
 MAKING_ROOM = [
-    Burst((), (Publish((STRANGERS,), False), RESERVED, Publish((OWNERS,), False)), 0.0),
-    Burst((), (Remove("a"), Publish((STRANGERS, STRANGERS, OWNERS), True), Remove("a")), 0.0),
-    Burst((), (Publish((STRANGERS,), False), Publish((OWNERS, STRANGERS), False), Publish((OWNERS,), True)), 1.5),
+    Burst((), [("publish", [STRANGERS], False), RESERVED, ("publish", [OWNERS], False)], 0.0),
+    Burst((), [("remove", "a"), ("publish", [STRANGERS, STRANGERS, OWNERS], True), ("remove", "a")], 0.0),
+    Burst(
+        (),
+        [
+            ("publish", each, drop)
+            for each, drop in (([STRANGERS], False), ([OWNERS, STRANGERS], False), ([OWNERS], True))
+        ],
+        1.5,
+    ),
 ]
 
 
@@ -558,7 +530,7 @@ def test_every_reader_reads_exactly_what_the_model_says(run: Run, on_conflict: O
     async def play() -> None:
         async with anyio.create_task_group() as tasks:
             game = Game(on_conflict, tasks)
-            game.happen(Join(1_000, 1))
+            game.join(1_000, 1)
             await game.play(bursts)
 
     run(play)

@@ -1,4 +1,4 @@
-"""A slow and obvious model of a bus and its buffers: poses, trees of samples, and the record of all that has happened.
+"""A slow and obvious model of a bus and its buffers: poses, trees of samples, and a bus.
 
 Poses turn about one tilted axis only, so that complex numbers are enough to work them out.
 """
@@ -344,39 +344,7 @@ def climb(parents: dict[str, str], name: str) -> list[str]:
     return walk
 
 
-# A model of a bus: what it gives each buffer, worked out anew from the list of all that has happened
-
-
-@dataclass(frozen=True)
-class Published:
-    batch: tuple[Sample, ...]
-
-
-@dataclass(frozen=True)
-class Removed:
-    frame: str
-
-
-@dataclass(frozen=True)
-class Reset:
-    """The clock has jumped back."""
-
-
-@dataclass(frozen=True)
-class Joined:
-    """A buffer has joined, with a window of `keep` ns, and the history of another one if `prefill` is its number."""
-
-    buffer: int
-    keep: int | None
-    prefill: int | None = None
-
-
-@dataclass(frozen=True)
-class Left:
-    buffer: int
-
-
-Entry = Published | Removed | Reset | Joined | Left
+# A model of a bus: what it gives each buffer
 
 
 @dataclass(frozen=True)
@@ -431,83 +399,60 @@ class Held:
 
 
 class PlainBus:
-    """The list of all that has happened, and what follows from it."""
+    """The newest edge of each child, the latched samples, and every buffer that has ever joined."""
 
     def __init__(self) -> None:
-        self.record: list[Entry] = []
+        self.edges: dict[str, Newest] = {}
+        self.latched: dict[str, Sample] = {}
+        self.buffers: list[Held] = []
 
-    def newest(self) -> dict[str, Newest]:
-        """The newest edge of each child."""
-        edges: dict[str, Newest] = {}
-        for entry in self.record:
-            if isinstance(entry, Published):
-                for sample in entry.batch:
-                    note(edges, sample)
-            elif isinstance(entry, Removed):
-                edges.pop(entry.frame, None)
-            elif isinstance(entry, Reset):
-                edges = {child: edge for child, edge in edges.items() if edge.stamp is None}
-        return edges
+    @property
+    def on_the_bus(self) -> list[int]:
+        """The numbers of the buffers that have joined and not left."""
+        return [number for number, held in enumerate(self.buffers) if held.on_the_bus]
 
     def refuses(self, batch: Sequence[Sample]) -> bool:
         """Whether the newest edges would form a loop after the batch."""
-        edges = self.newest()
+        edges = dict(self.edges)
         for sample in batch:
             note(edges, sample)
         return has_loop(edges)
 
     def knows(self, frame: str) -> bool:
         """Whether the bus or a buffer on it knows a frame."""
-        edges = self.newest()
-        held = [buffer for buffer in self.buffers().values() if buffer.on_the_bus]
-        return any(frame in (child, edge.parent) for child, edge in edges.items()) or any(
-            frame in buffer.tree.names() for buffer in held
+        return any(frame in (child, edge.parent) for child, edge in self.edges.items()) or any(
+            frame in self.buffers[number].tree.names() for number in self.on_the_bus
         )
 
-    def on_the_bus(self) -> list[int]:
-        """The buffers that have joined and not left."""
-        left = [entry.buffer for entry in self.record if isinstance(entry, Left)]
-        joined = [entry.buffer for entry in self.record if isinstance(entry, Joined)]
-        return [buffer for buffer in joined if buffer not in left]
+    def publish(self, batch: Sequence[Sample]) -> None:
+        for sample in batch:
+            note(self.edges, sample)
+            self.latched.pop(sample.child, None)
+            if sample.static:
+                self.latched[sample.child] = sample
+            for number in self.on_the_bus:
+                self.buffers[number].offer(sample)
 
-    def buffers(self) -> dict[int, Held]:
-        """Every buffer that has ever joined, as it has to be now."""
-        held: dict[int, Held] = {}
-        edges: dict[str, Newest] = {}
-        latched: dict[str, Sample] = {}
-        for entry in self.record:
-            on_the_bus = [buffer for buffer in held.values() if buffer.on_the_bus]
-            if isinstance(entry, Published):
-                for sample in entry.batch:
-                    note(edges, sample)
-                    latched.pop(sample.child, None)
-                    if sample.static:
-                        latched[sample.child] = sample
-                    for buffer in on_the_bus:
-                        buffer.offer(sample)
-            elif isinstance(entry, Removed):
-                edges.pop(entry.frame, None)
-                latched.pop(entry.frame, None)
-                for buffer in on_the_bus:
-                    buffer.remove(entry.frame)
-            elif isinstance(entry, Reset):
-                edges = {child: edge for child, edge in edges.items() if edge.stamp is None}
-                for buffer in on_the_bus:
-                    buffer.reset()
-            elif isinstance(entry, Joined):
-                held[entry.buffer] = joined(entry, held, edges, latched)
-            else:
-                held[entry.buffer].on_the_bus = False
-        return held
+    def remove(self, frame: str) -> None:
+        self.edges.pop(frame, None)
+        self.latched.pop(frame, None)
+        for number in self.on_the_bus:
+            self.buffers[number].remove(frame)
 
+    def reset(self) -> None:
+        """Note that the clock has jumped back."""
+        self.edges = {child: edge for child, edge in self.edges.items() if edge.stamp is None}
+        for number in self.on_the_bus:
+            self.buffers[number].reset()
 
-def joined(entry: Joined, held: dict[int, Held], edges: dict[str, Newest], latched: dict[str, Sample]) -> Held:
-    """A buffer that joins: it has what it is prefilled with, then the latched samples."""
-    if entry.prefill is None:
-        late = Held(PlainTree(entry.keep), {child: edge for child, edge in edges.items() if edge.stamp is not None})
-    else:
-        other = held[entry.prefill]
-        late = Held(other.tree.within(entry.keep), dict(other.unseen))
-    for sample in latched.values():
-        late.offer(sample)
-    return late
+    def join(self, keep: int | None, prefill: int | None) -> None:
+        """A buffer with a window of `keep` ns joins: it has the history of another one, then the latched samples."""
+        if prefill is None:
+            moving = {child: edge for child, edge in self.edges.items() if edge.stamp is not None}
+            late = Held(PlainTree(keep), moving)
+        else:
+            other = self.buffers[prefill]
+            late = Held(other.tree.within(keep), dict(other.unseen))
+        for sample in self.latched.values():
+            late.offer(sample)
+        self.buffers.append(late)
