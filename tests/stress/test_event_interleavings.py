@@ -511,14 +511,8 @@ RESERVED = ("reserve", "a", "slam")
 MAKING_ROOM = [
     Burst((), [("publish", [STRANGERS], False), RESERVED, ("publish", [OWNERS], False)], 0.0),
     Burst((), [("remove", "a"), ("publish", [STRANGERS, STRANGERS, OWNERS], True), ("remove", "a")], 0.0),
-    Burst(
-        (),
-        [
-            ("publish", each, drop)
-            for each, drop in (([STRANGERS], False), ([OWNERS, STRANGERS], False), ([OWNERS], True))
-        ],
-        1.5,
-    ),
+    Burst((), [("publish", [STRANGERS], False), ("publish", [OWNERS, STRANGERS], False)], 0.0),
+    Burst((), [("publish", [OWNERS], True)], 1.5),
 ]
 
 
