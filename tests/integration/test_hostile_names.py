@@ -106,11 +106,6 @@ def lines_of(text: str) -> list[str]:
     return lines
 
 
-def check(make: Callable[[Sequence[str]], str]) -> None:
-    """Check that a text has no control characters, and as many lines with all names as with plain ones."""
-    assert len(lines_of(make(NAMES))) == len(lines_of(make(PLAIN)))
-
-
 def check_each(make: Callable[[str], str]) -> None:
     """Check the texts that are made with one name each."""
     count = len(lines_of(make("plain")))
