@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -188,19 +189,6 @@ def test_a_process_that_is_held_up_for_a_part_of_its_lease_is_not_lost(processes
     assert not listener.said(event="PeerLost")
 
 
-def test_a_process_that_stands_still_for_a_moment_misses_nothing(processes: Crowd, place: Place) -> None:
-    # The sockets take some 250 KB of some 500; with less still, TCP itself stands still.
-    config = {"transport/link/tcp/so_sndbuf": 2**16, "transport/link/tcp/so_rcvbuf": 2**16}
-    here = processes.add(place.first(config=config))
-    there = processes.add(place.other(config=config))
-    meet(here, there)
-    there.signal(signal.SIGSTOP)
-    here.ask("stream", authority="burst", batches=190, rate=1_000)
-    there.signal(signal.SIGCONT)
-    there.ask("until", last={"burst": 189})
-    assert there.ask("facts")["tallies"]["burst"]["batches"] == 190
-
-
 def test_a_slow_and_a_frozen_process_delay_no_other(processes: Crowd, place: Place) -> None:
     # The lease outlasts the test, so no peer is spared by being lost.
     broadcaster = processes.add(place.first(lease=60.0))
@@ -308,77 +296,77 @@ def test_a_static_frame_that_comes_and_goes_is_there_at_last(processes: Crowd, p
         process.ask("until", x={"lidar": 1_000.0})
 
 
-# Event loops and programs that end without the end of their link, while messages keep coming.
+# Programs that end without the end of their link, while messages keep coming.
+BEGIN = """
+import asyncio, gc, sys, time
+import anyio
+from tfbus import Bus
+from tfbus.links.zenoh import ZenohLink
+
+# The broadcaster's stamps are of another time.
+bus = Bus(max_behind=None)
+link = ZenohLink(bus, DOMAIN, connect=ADDRESS)
+
+async def main():
+    heard = asyncio.Event()
+    bus.subscribe(lambda batch: heard.set())
+    await link.__aenter__()
+    await heard.wait()
+
+async def listen():
+    with bus.stream() as batches:
+        async with link:
+            async for batch in batches:
+                print("ready", flush=True)
+
+loop = asyncio.new_event_loop()
+"""
+CRASH = "loop.run_until_complete(main())\nprint('crash', flush=True)\n"
 CRASHES = {
     "the loop is closed": "loop.close(); time.sleep(0.1)",
     "the loop is left": "",
     "the link is forgotten": "loop.close(); del link; gc.collect()",
     "the program exits": "sys.exit(0)",
 }
+LISTEN = """
+try:
+    anyio.run(listen, backend=BACKEND)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+@contextmanager
+def program_beside(processes: Crowd, place: Place, text: str, **names: str) -> Iterator[subprocess.Popen[str]]:
+    """A program with a link, to which another process sends all the time, and which that loses in the end."""
+    broadcaster = processes.add(place.first())
+    broadcaster.start("stream", authority="wheels", batches=1_000_000, rate=1_000, size=5)
+    for name, value in (names | {"DOMAIN": place.domain, "ADDRESS": place.addresses[0]}).items():
+        text = text.replace(name, repr(value))
+    with subprocess.Popen(
+        [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+    broadcaster.wait(event="PeerLost")
 
 
 @pytest.mark.parametrize("end", CRASHES.values(), ids=CRASHES.keys())
 def test_a_link_that_was_never_ended_does_not_keep_the_program(end: str, processes: Crowd, place: Place) -> None:
-    broadcaster = processes.add(place.first())
-    broadcaster.start("stream", authority="wheels", batches=1_000_000, rate=2_000, size=5)
-    program = f"""
-import asyncio, gc, sys, time
-from tfbus import Bus
-from tfbus.links.zenoh import ZenohLink
-
-async def main():
-    bus, heard = Bus(), asyncio.Event()
-    bus.subscribe(lambda batch: heard.set())
-    link = ZenohLink(bus, {place.domain!r}, connect={place.addresses[0]!r})
-    await link.__aenter__()
-    await heard.wait()
-    return link
-
-loop = asyncio.new_event_loop()
-link = loop.run_until_complete(main())
-print("crash", flush=True)
-{end}
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False
-    )
-    assert (done.returncode, done.stdout) == (0, "crash\n"), done.stderr
-    broadcaster.wait(event="PeerLost")
+    with program_beside(processes, place, BEGIN + CRASH + end) as program:
+        assert (*program.communicate(timeout=PATIENCE), program.returncode) == ("crash\n", "", 0)
 
 
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 def test_ctrl_c_ends_a_program_with_a_link(backend: str, processes: Crowd, place: Place) -> None:
-    broadcaster = processes.add(place.first())
-    broadcaster.start("stream", authority="wheels", batches=1_000_000, rate=1_000, size=5)
-    program = f"""
-import anyio
-from tfbus import Bus
-from tfbus.links.zenoh import ZenohLink
-
-async def main():
-    # The broadcaster's stamps are of another time.
-    with Bus(max_behind=None) as bus, bus.stream() as batches:
-        async with ZenohLink(bus, {place.domain!r}, connect={place.addresses[0]!r}):
-            async for batch in batches:
-                print("ready", flush=True)
-
-try:
-    anyio.run(main, backend={backend!r})
-except KeyboardInterrupt:
-    print("interrupted")
-"""
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-        process.send_signal(signal.SIGINT)
-        try:
-            output, errors = process.communicate(timeout=PATIENCE)
-        finally:
-            process.kill()
-    assert (output.splitlines()[-1], errors, process.returncode) == ("interrupted", "", 0)
-    broadcaster.wait(event="PeerLost")
+    with program_beside(processes, place, BEGIN + LISTEN, BACKEND=backend) as program:
+        assert program.stdout is not None
+        assert program.stdout.readline() == "ready\n"
+        program.send_signal(signal.SIGINT)
+        output, errors = program.communicate(timeout=PATIENCE)
+    assert (output.splitlines()[-1], errors, program.returncode) == ("interrupted", "", 0)
 
 
 def test_processes_that_start_together_all_have_every_static_frame() -> None:

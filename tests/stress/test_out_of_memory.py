@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pytest
-from support.both_kernels import tfbus_on
 from support.histories import live_tree, tree_over
 from support.samples import moving, static
 
@@ -158,36 +157,6 @@ def test_a_batch_is_stored_whole_or_not_at_all_in_every_buffer_and_the_next_ones
         assert [buffer.lookup_nowait("map", "b").stamp for buffer in scene.buffers] == [20, 20]
 
     assert sweep(lambda scene: scene.bus.publish(chain(6)), Scene, check, plain=True) > 0
-
-
-@pytest.mark.parametrize("late", [False, True])
-def test_the_twin_stores_a_sample_whole_or_not_at_all(late: bool) -> None:
-    twin = tfbus_on("python")
-
-    def at(stamp: int) -> Any:
-        return twin.TransformStamped("map", "a", stamp, twin.Transform((float(stamp**2), 0.0, 0.0)))
-
-    # Of so many samples, some do not fit into the memory of those before, and some make others leave the window.
-    for count in range(1, 40):
-        newest = 2 * count - 2
-        sample = at(newest - 1 if late else newest + 2)
-
-        def fresh(count: int = count) -> Any:
-            bus = twin.Bus()
-            buffer = twin.Buffer(bus, keep=5e-8)
-            for index in range(count):
-                bus.publish(at(2 * index))
-            return bus, buffer
-
-        def check(scene: Any, newest: int = newest) -> None:
-            bus, buffer = scene
-            assert buffer.lookup_nowait("map", "a").stamp in (newest, newest + 2)
-            bus.publish(at(newest + 4))
-            assert buffer.lookup_nowait("map", "a").stamp == newest + 4
-            for stamp in [*range(max(0, newest - 46), newest + 1, 2), newest + 4]:
-                assert buffer.lookup_nowait("map", "a", stamp).transform.translation[0] == stamp**2
-
-        assert sweep(lambda scene, sample=sample: scene[0].publish(sample), fresh, check, plain=False) > 0
 
 
 def test_no_failed_allocation_leaks_a_reference() -> None:
