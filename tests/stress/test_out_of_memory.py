@@ -12,8 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pytest
-from support.histories import live_tree, tree_over
-from support.samples import moving, static
+from support.samples import live_tree, moving, static, tree_over
 
 import tfbus
 from tfbus import Buffer, Bus, FutureExtrapolationError, Question, TransformArray, TransformStamped
