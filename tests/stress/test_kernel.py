@@ -107,7 +107,7 @@ def test_nothing_that_a_user_can_do_leaks_memory_or_references(monkeypatch: pyte
                 lambda: buffer.lookup_nowait(target, source, 1),
                 lambda: buffer.lookup_nowait(target, "x", 5),
                 lambda: buffer.tree.lookup_many(target, source, [60, 900]),
-                lambda: buffer.tree.lookup_many(target, source, [60, "x"]),  # type: ignore[list-item]
+                lambda: buffer.tree.lookup_many(target, source, [60, "x"]),  # type: ignore[arg-type]
             ):
                 with pytest.raises((TransformError, TypeError, ValueError)):
                     wrong()

@@ -201,6 +201,10 @@ class Sleepers:
         self.live.park(Waiter(Question("map", "tip", 6), 0, asleep.clear), caught.value)
         self.asleep.append(asleep)
 
+    def insert_one_after_the_other(self) -> None:
+        for sample in chain(6):
+            self.live.insert((sample,))
+
     def cancel(self) -> None:
         for waiter in list(self.live.waiting.parked):
             self.live.waiting.remove(waiter)
@@ -208,7 +212,7 @@ class Sleepers:
 
 CHANGES: dict[str, Callable[[Sleepers], object]] = {
     "insert": lambda scene: scene.live.insert(chain(6)),
-    "insert one after the other": lambda scene: [scene.live.insert((sample,)) for sample in chain(6)],
+    "insert one after the other": Sleepers.insert_one_after_the_other,
     "park": Sleepers.park,
     "cancel": Sleepers.cancel,
 }

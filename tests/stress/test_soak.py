@@ -7,7 +7,7 @@ tells nearly the same story again.
 import math
 import threading
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import suppress
 from functools import partial
 from random import Random
@@ -173,7 +173,7 @@ class Soak:
         with self.thread as publish:
             while self.going():
                 samples = [moving("base", "arm", self.clock.now(), authority="thread")] * rng.randrange(10)
-                thread = threading.Thread(target=lambda samples=samples: [publish(sample) for sample in samples])
+                thread = threading.Thread(target=publish_all, args=(publish, samples))
                 thread.start()
                 thread.join()
                 self.attempted += len(samples)
@@ -324,6 +324,11 @@ class Soak:
         if not self.bus.closed:
             self.bus.reserve("tool", "somebody else").close()
         self.bus.close()
+
+
+def publish_all(publish: Callable[[TransformStamped], object], samples: Iterable[TransformStamped]) -> None:
+    for sample in samples:
+        publish(sample)
 
 
 def policy(rng: Random) -> dict[str, Any]:
