@@ -21,51 +21,14 @@ from tfbus import (
     LATEST,
     Buffer,
     Bus,
+    SimulatedClock,
     Transform,
     TransformError,
     TransformLookupError,
     TransformStamped,
-    TransformTree,
 )
 
 pytestmark = pytest.mark.thorough
-
-
-def test_four_threads_read_whole_answers_while_the_loop_inserts() -> None:
-    """Left and right always move together, so any mixture of two states would be a distance between them."""
-    tree = TransformTree(keep=1e-6)
-    tree.insert_many([*over("base", "left", [0, 1]), *over("base", "right", [0, 1]), static("left", "lamp")])
-    faults: list[object] = []
-    answers = [0]
-
-    def read() -> None:
-        rng = random.Random()
-        try:
-            newest = tree.latest_common_stamp("base", "left") or 0
-            at: Any = rng.choice([LATEST, newest, newest - rng.randrange(900)])
-            found = tree.lookup("lamp", "right", at).transform.translation
-            many = tree.lookup_many("lamp", "right", np.arange(newest - 400, newest), out_of_range="nan")
-        except TransformLookupError:
-            return
-        answers[0] += 1
-        if any(found) or many.translations[many.valid].any():
-            faults.append((found, many))
-
-    def insert() -> None:
-        rng = random.Random(1)
-        for stamp in range(2, 6_000):
-            parent = "base" if rng.random() < 0.98 else "other"
-            tree.insert_many(moving(parent, side, stamp, float(stamp)) for side in ("left", "right"))
-            if rng.random() < 0.1:
-                late = stamp - rng.randrange(1, 30)
-                tree.insert_many(moving("base", side, max(late, 0), float(late)) for side in ("left", "right"))
-            if rng.random() < 0.01:
-                tree.copy()
-
-    with threads_that(read, 4):
-        insert()
-    assert faults == []
-    assert answers[0] > 100
 
 
 @needs_both
@@ -81,7 +44,8 @@ def test_nothing_that_a_user_can_do_leaks_memory_or_references(monkeypatch: pyte
         return TransformStamped(target, source, stamp, Transform((float(stamp), 0.0, 0.0)), me)
 
     async def use() -> None:
-        with Bus(max_ahead=None, max_behind=None) as bus, Buffer(bus, keep=5e-8) as buffer:
+        # Timers of the loop would remember the lookups for 5 s.
+        with Bus(SimulatedClock()) as bus, Buffer(bus, keep=5e-8) as buffer:
             for batch in (sample(0), [sample(stamp) for stamp in range(1, 90)], (sample(60), sample(60)), sample(3)):
                 bus.publish(batch)
             found = buffer.lookup_nowait(target, source, 60)
@@ -114,9 +78,12 @@ def test_nothing_that_a_user_can_do_leaks_memory_or_references(monkeypatch: pyte
             bus.remove_frame(source)
 
     async def grown() -> int:
-        """The bytes that a hundred calls leave behind, whenever they are made: the least of several times."""
+        """The bytes that a hundred calls leave behind, whenever they are made: the least of several times.
+
+        What CPython keeps for reuse is replaced by memory that is traced, ever less of it.
+        """
         sizes = []
-        for _ in range(4):
+        for _ in range(10):
             for _ in range(100):
                 await use()
             gc.collect()
@@ -128,40 +95,57 @@ def test_nothing_that_a_user_can_do_leaks_memory_or_references(monkeypatch: pyte
     before = [sys.getrefcount(thing) for thing in shared]
     tracemalloc.start()
     try:
-        # The smallest object that a call could leak would make 1,600.
-        assert anyio.run(grown) < 1_000
+        # The smallest object that a call could leak would make 2,400.
+        assert anyio.run(grown) < 2_000
     finally:
         tracemalloc.stop()
     assert [sys.getrefcount(thing) for thing in shared] == before
 
 
 def test_four_threads_read_whole_answers_while_the_loop_publishes_and_wakes() -> None:
-    """Left and right always move together; and each lookup that waits gets the answer of its own stamp."""
-    bus = Bus(max_ahead=None)
+    """Left and right always move together, and each lookup that waits gets the answer of its own stamp."""
+    bus = Bus(max_ahead=None, max_behind=None)
     buffer = Buffer(bus, keep=1e-6)
-    bus.publish([*over("base", "left", [0]), *over("base", "right", [0])])
+    bus.publish([*over("base", "left", [0, 1]), *over("base", "right", [0, 1]), static("left", "lamp")])
+    tree = buffer.tree
     faults: list[object] = []
     answers = [0]
 
     def read() -> None:
-        found = buffer.lookup_nowait("left", "right").transform.translation
+        rng = random.Random()
+        try:
+            newest = tree.latest_common_stamp("base", "left") or 0
+            at: Any = rng.choice([LATEST, newest, newest - rng.randrange(900)])
+            found = buffer.lookup_nowait("lamp", "right", at).transform.translation
+            many = tree.lookup_many("lamp", "right", np.arange(newest - 400, newest), out_of_range="nan")
+        except TransformLookupError:
+            return
         answers[0] += 1
-        if any(found):
-            faults.append(found)
+        if any(found) or many.translations[many.valid].any():
+            faults.append((found, many))
 
     async def wait(stamp: int) -> None:
-        found = await buffer.lookup("base", "left", stamp, timeout=60.0)
-        if (found.stamp, found.transform.translation[0]) != (stamp, float(stamp)):
+        found = await buffer.lookup("lamp", "right", stamp, timeout=60.0)
+        if (found.stamp, *found.transform.translation) != (stamp, 0.0, 0.0, 0.0):
             faults.append(found)
 
     async def publish() -> None:
-        for stamp in range(1, 2_000):
+        rng = random.Random(1)
+        for stamp in range(2, 3_000):
+            # Late ones as well, and now and then below another parent.
+            late = [max(stamp - rng.randrange(1, 30), 0)] if rng.random() < 0.1 else []
+            parent = "base" if rng.random() < 0.98 else "other"
+            batches = [[moving("base", side, at, float(at)) for side in ("left", "right")] for at in late]
+            batches.append([moving(parent, side, stamp, float(stamp)) for side in ("left", "right")])
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(wait, stamp)
                 tasks.start_soon(wait, stamp)
                 while len(buffer.pending()) < 2:
                     await anyio.lowlevel.checkpoint()
-                bus.publish([moving("base", side, stamp, float(stamp)) for side in ("left", "right")])
+                for batch in batches:
+                    bus.publish(batch)
+            if rng.random() < 0.01:
+                tree.copy()
 
     with threads_that(read, 4):
         anyio.run(publish)

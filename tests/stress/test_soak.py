@@ -4,10 +4,9 @@ Every actor does one kind of thing, with random numbers and at moments of its ow
 tells nearly the same story again.
 """
 
-import math
 import threading
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from contextlib import suppress
 from functools import partial
 from random import Random
@@ -33,7 +32,6 @@ from tfbus import (
     Hold,
     InvalidTransformError,
     LookupTimeoutError,
-    MessageFilter,
     PastExtrapolationError,
     SampleRejected,
     SimulatedClock,
@@ -60,7 +58,6 @@ DOCUMENTED = (*USUAL_ERRORS, AheadError)
 MET = {
     "answered",
     *(error.__name__ for error in USUAL_ERRORS),
-    *("watched", "too old", "queue full", "timed out", "unknown frame", "clock reset"),
     *("cycle", "reserved", "not a sample"),
 }
 """What the soaks meet between them; without it there would be nothing to see."""
@@ -80,7 +77,6 @@ class Soak:
         self.attempted = self.accepted = self.raised = 0
         self.met: Counter[str] = Counter()
         self.asked: list[Asked[TransformStamped]] = []
-        self.filters: list[MessageFilter[Any, Any]] = []
         self.events = self.bus.events(capacity=1_000_000, stale_after=0.3)
         self.bus.subscribe(self.hear)
 
@@ -99,7 +95,7 @@ class Soak:
             partial(self.read, capacity=3, overflow="conflate"),
             partial(self.read, capacity=10, overflow="drop_oldest"),
             self.come_and_go,
-            *[self.ask, self.watch, self.filter_messages] * 3,
+            *[self.ask] * 3,
         ]
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(self.end, tasks)
@@ -229,8 +225,6 @@ class Soak:
                 left = offered - read - stream.dropped - stream.queue.conflated
                 assert 0 <= left <= len(stream.queue)
 
-    # Lookups, watches and message filters, cut short at random
-
     async def ask(self, rng: Random) -> None:
         async with anyio.create_task_group() as tasks:
             while self.going():
@@ -245,44 +239,6 @@ class Soak:
                     rng.choice(self.asked[-20:]).cancel()
                 await self.pause(rng, 0.15)
 
-    async def watch(self, rng: Random) -> None:
-        while self.going():
-            options = {**policy(rng), "max_age": rng.choice((None, 0.5)), "max_rate": rng.choice((None, 5.0))}
-            changes = rng.choice(self.buffers).watch(*rng.sample(FRAMES, 2), **options)
-            with changes, self.clock.move_on_after(longest(rng)), suppress(ClockResetError):
-                async for _ in changes:
-                    self.met["watched"] += 1
-                    await self.pause(rng, 0.4)
-            await self.pause(rng, 0.2)
-
-    async def filter_messages(self, rng: Random) -> None:
-        async def messages() -> AsyncIterator[tuple[str, int]]:
-            while True:
-                await self.pause(rng, 0.1)
-                stamp = self.clock.now() + from_seconds(rng.uniform(-2.0, 0.5))
-                yield rng.choice((*FRAMES, "nobody")), stamp
-
-        while self.going():
-            await self.pause(rng, 0.2)
-            pairs: MessageFilter[Any, Any] = MessageFilter(
-                messages(),
-                rng.choice(self.buffers),
-                "map",
-                frame=lambda message: message[0],
-                stamp=lambda message: message[1],
-                timeout=rng.choice((None, 0.0, 0.2, 1.0)),
-                capacity=rng.randint(1, 6),
-                overflow=rng.choice(("drop_oldest", "drop_newest", "block")),
-                order=rng.choice(("ready", "stamp", "arrival")),
-            )
-            self.filters.append(pairs)
-            with self.clock.move_on_after(longest(rng)):
-                async with pairs:
-                    async for _ in pairs:
-                        await self.pause(rng, 0.3)
-            assert pairs.pending == 0
-            self.met.update(pairs.dropped)
-
     # What must hold
 
     def check_counters(self) -> None:
@@ -294,8 +250,6 @@ class Soak:
         judged = counted.samples + sum(counted.rejected.values()) - counted.rejected.get("displaced", 0)
         assert self.attempted == judged + self.thread.queue.dropped
         assert counted.callbacks_failed == self.raised
-        for pairs in self.filters:
-            assert pairs.arrived == pairs.delivered + sum(pairs.dropped.values()) + pairs.pending
 
     def check_lookups(self) -> None:
         """Check that every lookup has ended in an answer or one of the documented errors, or was cancelled."""
@@ -335,11 +289,6 @@ def policy(rng: Random) -> dict[str, Any]:
     kind = rng.choice(("none", "none", "tolerance", "max_gap", "extrapolate"))
     seconds = rng.uniform(0.0, 0.4)
     return {} if kind == "none" else {kind: Hold(seconds) if kind == "extrapolate" else seconds}
-
-
-def longest(rng: Random) -> float:
-    """The time that an actor goes on, in s; now and then there is no end to it."""
-    return math.inf if rng.random() < 0.1 else rng.uniform(0.0, 4.0)
 
 
 @pytest.mark.thorough
