@@ -63,7 +63,7 @@ def anchors_of(page: Path) -> set[str]:
 
 
 def commands_of(page: Path) -> list[str]:
-    """The command lines of a page, without comments; those that are joined by ``&&`` each for itself."""
+    """The command lines of a page, without comments; commands that ``&&`` joins count one by one."""
     lines = [line for match in CONSOLE.finditer(page.read_text()) for line in (match[1] or match[2]).splitlines()]
     commands = [part.strip() for line in lines for part in line.partition(" # ")[0].split("&&")]
     return [command for command in commands if re.match(r"(tfbus|pip install) ", command)]

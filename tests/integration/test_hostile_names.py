@@ -393,7 +393,7 @@ ON_DOMAIN = {
     "tree": ("tree",),
 }
 OF_BOTH = {"play": ("play", 0, "--rate", "inf"), "record": ("record", "NEW", "--duration", "0")}
-# What these print has only names that their user gives, and texts of errors.
+# These print only names that their user gives, and texts of errors.
 OWN = {"bridge", "broadcast", "demo", "foxglove", "listen", "router", "view"}
 
 

@@ -79,7 +79,7 @@ class World:
         authority = "you" if rng.random() < 0.01 else "me"
         return tfbus.TransformStamped(parent, child, self.stamp(), transform, authority, rng.random() < 0.01)
 
-    # What may happen
+    # Steps
 
     def publish(self) -> None:
         rng = self.rng

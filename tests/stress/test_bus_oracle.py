@@ -178,7 +178,7 @@ class Child:
         return before.pose.towards(after.pose, (at - before.stamp) / (after.stamp - before.stamp))
 
     def facts(self, name: str, at: At) -> Facts:
-        """Those of the error that says that `at` is not covered."""
+        """The facts of the error that says that `at` is not covered."""
         stamps = self.stamps
         if not stamps:
             return FutureExtrapolationError, name, None, None
@@ -193,7 +193,7 @@ class PlainTree:
     keep: int | None
     children: dict[str, Child] = field(default_factory=dict)
 
-    # What is stored
+    # Storing
 
     def store(self, sample: Sample) -> Outcome:
         known = self.children.get(sample.child)
@@ -241,7 +241,7 @@ class PlainTree:
             children[name] = Child(child.parent, child.static, list(samples))
         return PlainTree(keep, children)
 
-    # What is asked
+    # Questions
 
     def names(self) -> set[str]:
         named = set(self.children)
@@ -381,7 +381,7 @@ class Newest:
 
 
 def note(edges: dict[str, Newest], sample: Sample) -> None:
-    """Of two kinds the last one wins, of moving samples the newest."""
+    """The last sample decides on the kind; among moving samples the newest one counts."""
     before = edges.get(sample.child)
     if sample.static:
         edges[sample.child] = Newest(sample.parent, None)
@@ -570,9 +570,9 @@ PLACES: list[tuple[int, ...]] = [(), (), (), (), (), (0,), (1,), (2, 0)]
 def random_schedule(seed: int) -> list[Burst]:
     """One of as many schedules as there are numbers, always the same for a number."""
     random = Random(seed)
-    # What is frequent differs from schedule to schedule, so that each kind comes often somewhere.
+    # The weights differ from schedule to schedule, so that each kind is frequent in some.
     weights = [random.choice((1, 2, 5)) for _ in range(6)]
-    # Where parents change all the time, lookups are woken all the time, and a wake-up that is missing is not missed.
+    # Changes of parents wake all lookups, which would hide a missing wake-up: some schedules have none.
     edges = random.choice((EDGES, STEADY_EDGES))
 
     def happening() -> Happening:
@@ -674,7 +674,7 @@ class Game:
         self.check()
         self.ask_every_buffer(9)
 
-    # What happens
+    # Happenings
 
     def happen(self, kind: str, *what: Any) -> None:
         if self.bus.closed and kind in ("publish", "remove", "join"):
@@ -761,7 +761,7 @@ class Game:
         waiting.asked.cancel()
         return waiting
 
-    # What must be
+    # Checks
 
     def expected(self, waiting: Waiting) -> Answer | Blocked:
         ask, tree = waiting.ask, self.plain.buffers[waiting.place].tree

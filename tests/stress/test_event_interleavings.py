@@ -52,7 +52,7 @@ AUTHORITIES = ("", "odometry", "slam")
 CRASHES = Transform((9.0, 0.0, 0.0))
 
 
-# What can happen; ages and durations in s
+# The happenings; ages and durations in s
 
 
 class Draft(NamedTuple):
@@ -98,7 +98,7 @@ class Edge:
 
 @dataclass
 class Reader:
-    """The events that a stream holds, and those that its reader has read."""
+    """The events that a stream holds, and the events that its reader has read."""
 
     capacity: int
     limit: float

@@ -236,7 +236,7 @@ class Game:
         assert error is not None or reason in ("queue full", "closed")
         self.dropped.append((message, reason))
 
-    # What happens, on both sides
+    # Steps, for the filter and for the model
 
     def made(self, drawn: Iterable[tuple[str, int]]) -> list[Message]:
         return [Message(next(self.numbers), frame, stamp) for frame, stamp in drawn]

@@ -239,7 +239,7 @@ class Soak:
                     rng.choice(self.asked[-20:]).cancel()
                 await self.pause(rng, 0.15)
 
-    # What must hold
+    # Checks
 
     def check_counters(self) -> None:
         counted = self.bus.statistics()

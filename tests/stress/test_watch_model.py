@@ -167,7 +167,7 @@ def test_a_reader_gets_what_the_model_says_whatever_happens_meanwhile(
 def happen(kind: str, what: Any, clock: SimulatedClock, bus: Bus, buffer: Buffer, watch: Watch, model: Model) -> None:
     """One step, for the real thing and for the model."""
     if model.closed:
-        # What is published after the end may be in the last answer, or not.
+        # The last answer may or may not have samples that come after the end.
         return
     deaf = model.ended
     if kind == "publish" and not bus.closed:

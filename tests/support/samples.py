@@ -1,4 +1,4 @@
-"""Short ways to write samples of which only the parent, the stamp and x matter, and to ask for that x."""
+"""Short ways to write samples of which only the parent, the stamp and x matter; histories, and trees without a bus."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -90,7 +90,7 @@ def moving_edge(
 
 
 def held(history: FrameHistory) -> int:
-    """The number of samples that a history has memory for, those that have left its window included."""
+    """The number of samples that a history has memory for; some may have left its window."""
     if tfbus.kernel == "python":
         return len(history.stamps)
     return memoryview(history.columns(0, history.count)[0]).nbytes // 64

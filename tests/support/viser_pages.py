@@ -1,4 +1,4 @@
-"""A client of the websocket of a page, which sees and sends what a browser does."""
+"""A client of the websocket of a page, which sees and sends what a browser does, and a real browser."""
 
 import os
 import re
@@ -196,7 +196,7 @@ _ARGUMENTS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--no-sandbox",
-    # Whatever the page wants from elsewhere must fail.
+    # The page must not load anything from elsewhere.
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
 )
 
