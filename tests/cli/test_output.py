@@ -12,9 +12,9 @@ import time
 from pathlib import Path
 
 import pytest
+from support.commands import Terminal, on_a_terminal
 from support.processes import PATIENCE, TFBUS
 from support.recorded import SMALL
-from support.terminal import Terminal, on_a_terminal
 
 from tfbus import Transform
 from tfbus.cli.arguments import UsageError

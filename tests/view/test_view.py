@@ -12,10 +12,9 @@ import pytest
 pytest.importorskip("viser", reason="the live page needs viser")
 
 from anyio.lowlevel import checkpoint
-from support.browsers import Browser, in_browser
 from support.processes import free_ports
 from support.samples import moving, over, static
-from support.viser_pages import CLICK, PageClient, on_page
+from support.viser_pages import CLICK, Browser, PageClient, in_browser, on_page
 
 from tfbus import (
     LATEST,

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import anyio
 import pytest
-from support.commands import Command, Done, check_wrong_call, nobody
+from support.commands import Command, Done, Terminal, check_wrong_call, nobody
 from support.processes import TFBUS, free_address, new_domain, start_tfbus, until
 from support.recorded import SMALL, WRONG_IN_SMALL, messages_in, write_mcap
 from support.samples import moving, static
-from support.terminal import Terminal
 
 from tfbus import SECOND, Bus, PeerJoined, SystemClock, TransformStamped
 from tfbus.cli.commands.play import Keyboard, keyboard, press
