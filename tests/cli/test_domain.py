@@ -337,32 +337,39 @@ def test_what_is_no_place_of_ros_is_a_usage_error(place: str, why: str) -> None:
 
 
 @pytest.mark.thorough
-def test_every_command_that_joins_a_domain_joins_ros(tmp_path: Path) -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("kind", ["domain", "ros"])
+def test_programs_of_all_commands_meet_on_a_domain_and_on_ros(tmp_path: Path, kind: str, backend: str) -> None:
     for extra in ("cyclonedds", "urdf_parser_py"):
         pytest.importorskip(extra)
     number = 100 + os.getpid() % 99
-    ros, other = ("--ros", f"dds:{number}"), ("--ros", f"dds:{number + 1}")
+    names = (new_domain(), new_domain()) if kind == "domain" else (f"dds:{number}", f"dds:{number + 1}")
+    here, there = ((f"--{kind}", name, "--backend", backend) for name in names)
+    place, other = (f"domain {name!r}" if kind == "domain" else f"ROS at {name}" for name in names)
     recording, urdf = str(tmp_path / "drive.mcap"), tmp_path / "arm.urdf"
     urdf.write_text(URDF)
     with (
-        start_tfbus("broadcast", *ros) as broadcast,
-        start_tfbus("static", "base_laser", "camera", "--xyz", "1", "0", "0", *ros),
-        start_tfbus("robot", str(urdf), *ros) as robot,
-        start_tfbus("listen", *ros) as listen,
+        start_tfbus("broadcast", *here) as broadcast,
+        start_tfbus("static", "base_laser", "camera", "--xyz", "1", "0", "0", *here),
+        start_tfbus("robot", str(urdf), *here) as robot,
+        start_tfbus("listen", *here) as listen,
     ):
-        assert broadcast.errors.expect("broadcasting").endswith(f"on ROS at dds:{number}, until Ctrl-C")
+        assert broadcast.errors.expect("broadcasting").endswith(f"on {place}, until Ctrl-C")
         assert "base_link" in listen.output.expect("base_laser")
-        assert f"on ROS at dds:{number}" in robot.errors.expect("publishing")
-        with start_tfbus("echo", "base_link", "camera", *ros) as echo, start_tfbus("record", recording, *ros) as record:
+        assert f"on {place}" in robot.errors.expect("publishing")
+        with (
+            start_tfbus("echo", "base_link", "camera", *here) as echo,
+            start_tfbus("record", recording, *here) as record,
+        ):
             echo.output.expect("Translation")
-            record.errors.expect("recording ROS at")
-            with start_tfbus("tree", *ros) as tree:
+            record.errors.expect(f"recording {place}")
+            with start_tfbus("tree", *here) as tree:
                 assert tree.wait() == 0
             assert {"base_laser", "camera", "hand"} <= set(re.findall(r"\w+", tree.output.text))
             assert record.end() == 130
-    with start_tfbus("echo", "base_link", "camera", *other) as there, start_tfbus("play", recording, *other) as play:
-        play.errors.expect(f"on ROS at dds:{number + 1}")
-        there.output.expect("Translation")
+    with start_tfbus("echo", "base_link", "camera", *there) as echo, start_tfbus("play", recording, *there) as play:
+        play.errors.expect(f"on {other}")
+        echo.output.expect("Translation")
 
 
 @pytest.mark.anyio

@@ -6,21 +6,17 @@ import io
 import logging
 import os
 import re
-import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
-from support.processes import PATIENCE, TFBUS
-from support.recorded import SMALL
-from support.terminal import Terminal, on_a_terminal
+from support.terminal import Terminal
 
 from tfbus import Transform
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.output import (
     Column,
-    cells,
     csv_name,
     csv_writer,
     format_counts,
@@ -31,7 +27,6 @@ from tfbus.cli.output import (
     print_now,
     say,
     shorten,
-    shorten_widest,
     table_lines,
     terminal_width,
     track,
@@ -144,11 +139,6 @@ def test_a_pipe_has_room_for_any_line_unless_the_environment_says_otherwise(monk
     assert isinstance(terminal_width(), int)
 
 
-@pytest.mark.parametrize(("text", "width"), [("", 0), ("map", 3), ("雷达", 4), ("e\u0301", 1), ("Straße", 6)])
-def test_a_wide_letter_takes_two_columns_and_a_combining_mark_none(text: str, width: int) -> None:
-    assert cells(text) == width
-
-
 @pytest.mark.parametrize(
     ("text", "width", "shortened"),
     [
@@ -171,14 +161,6 @@ def test_a_line_is_broken_between_words_and_a_longer_word_is_shortened() -> None
     assert wrapped("one two three", None, 2) == wrapped("one two three", 13, 2) == ["one two three"]
     assert wrapped("one two three", 8, 2) == ["one two", "  three"]
     assert wrapped("at /a/very/long/path it is", 10, 2) == ["at", "  /a/…path", "  it is"]
-
-
-def test_the_widest_columns_give_way_first() -> None:
-    assert shorten_widest([20, 10, 3], 40) == [20, 10, 3]
-    assert shorten_widest([20, 10, 3], 28) == [15, 10, 3]
-    assert shorten_widest([20, 10, 3], 21) == [9, 9, 3]
-    assert shorten_widest([20, 10, 3], 5) == [8, 8, 3]
-    assert shorten_widest([], 5) == []
 
 
 COLUMNS = (Column("name"), Column("least", importance=1), Column("count", right=True, importance=2))
@@ -227,26 +209,6 @@ def test_the_bar_is_on_standard_error_and_leaves_the_output_alone(
     assert shown.count("notice\n") == 3
     # At its end, the bar erases its line.
     assert shown.endswith("\x1b[2K")
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("command", "steps"),
-    [
-        (("info", str(SMALL)), ["reading"]),
-        (("query", str(SMALL), "map", "box", "--every", "0.001", "--json"), ["reading", "looking up"]),
-    ],
-)
-def test_on_a_terminal_a_command_prints_the_same_beside_its_bar(
-    tmp_path: Path, command: tuple[str, ...], steps: list[str]
-) -> None:
-    plain = subprocess.run([TFBUS, *command], capture_output=True, text=True, timeout=PATIENCE, check=True)
-    status, shown = on_a_terminal(tmp_path / "output", *command)
-    assert status == 0
-    assert (tmp_path / "output").read_text() == plain.stdout
-    for step in steps:
-        assert step in shown
-        assert step not in plain.stderr
 
 
 LOGGER = logging.getLogger("tfbus")

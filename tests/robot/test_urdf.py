@@ -246,19 +246,6 @@ def test_an_error_about_an_element_pickles() -> None:
 
 
 @pytest.mark.thorough
-def test_without_urdf_parser_py_the_error_names_the_extra() -> None:
-    hidden = (
-        "import sys; sys.modules['urdf_parser_py'] = None\n"
-        "import tfbus\n"
-        "try: tfbus.RobotModel.from_urdf('<robot/>')\n"
-        "except ImportError as error: print(error)"
-    )
-    done = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True, check=True)
-    expected = 'to read URDF, tfbus needs a package more: pip install "tfbus[urdf]", or ".[urdf]" in a checkout\n'
-    assert done.stdout == expected
-
-
-@pytest.mark.thorough
 def test_reading_does_not_depend_on_asserts() -> None:
     """The parser checks with ``assert``, which ``python -O`` leaves out."""
     script = (

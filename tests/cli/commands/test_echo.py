@@ -1,5 +1,4 @@
 import json
-import signal
 from collections.abc import Sequence
 
 import anyio
@@ -111,28 +110,6 @@ def test_no_age_is_shown_and_nothing_is_told_before_the_time_of_a_simulation_is_
         lines = {line for line in done.stdout.splitlines() if line.startswith("At")}
         assert lines == {f"At 100.000000000 s, {'age 50 ms' if heard else 'age not known'}: 'base' in 'map'"}
     assert "behind" not in done.stderr
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_it_prints_what_programs_on_the_domain_send_and_notices_their_death(backend: str) -> None:
-    domain, address = new_domain(), free_address()
-    options = ("--domain", domain, "--backend", backend)
-    to_echo = ("--connect", address, *options)
-    limits = ("--rate", "5", "--max-age", "2")
-    with start_tfbus("echo", "camera", "base_laser", *limits, "--listen", address, *options) as echo:
-        waiting = echo.errors.expect("waiting")
-        with start_tfbus("static", "base_link", "camera", "--xyz", "0", "0", "1", *to_echo):
-            missing = echo.errors.expect("waiting")
-            with start_tfbus("broadcast", *to_echo) as broadcaster:
-                echo.output.expect(r"^At \d+\.\d{9} s, age .* ms: 'base_laser' in 'camera'$")
-                assert echo.output.expect("Translation") == "- Translation: [0.100000, 0.000000, -0.800000] m"
-                broadcaster.end(signal.SIGKILL)
-            assert "from 'robot_tf_publisher'" in echo.errors.expect("waiting for 'base_laser' in 'camera': frame")
-        assert echo.end() == 130
-    assert waiting == f"waiting for transforms on domain '{domain}' …"
-    assert missing == "waiting for 'base_laser' in 'camera': frame 'base_laser' is not known, did you mean 'base_link'?"
-    assert len(echo.errors.text.splitlines()) == 3
 
 
 @pytest.mark.thorough

@@ -88,10 +88,6 @@ def test_names_are_no_markup_and_not_cut_where_the_output_is_no_terminal(tmp_pat
     assert rows[long][0] == ":robot:"
 
 
-def test_no_line_ends_with_blanks(tfbus: Command) -> None:
-    assert all(line == line.rstrip() for line in tfbus("info", SMALL, "--wide").stdout.splitlines())
-
-
 def test_a_frame_of_both_kinds_shows_both(tmp_path: Path, tfbus: Command) -> None:
     lines = [(1, "/tf_static", [static("a", "b")]), (2, "/tf", [moving("a", "b", 1)])]
     assert rows_of(tfbus("info", write_mcap(tmp_path / "run.mcap", lines)).stdout)["b"][:3] == [

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 from support.commands import Command, check_wrong_call
-from support.recorded import SMALL, Line, real, write_mcap
+from support.recorded import SMALL, Line, write_mcap
 from support.samples import moving, static
 
-from tfbus import TransformTree, from_seconds
 from tfbus.cli.commands.query import Row, print_rows
 from tfbus.recording import load
 
@@ -188,16 +187,6 @@ def test_an_unfinished_recording_is_a_warning_on_standard_error(tmp_path: Path, 
     assert done.stderr == f"tfbus: left out of {path}: 1 x unfinished\ntfbus: {why}\n"
 
 
-def test_a_real_recording_has_the_transform_of_a_lookup(tfbus: Command) -> None:
-    path = real("turtlesim.bag")
-    tree: TransformTree = load(path)
-    stamp = from_seconds(1_396_293_900)
-    (line,) = tfbus("query", path, "turtle2", "carrot", "--at", "1396293900", "--json").stdout.splitlines()
-    found = tree.lookup("turtle2", "carrot", stamp).transform
-    assert json.loads(line)["translation"] == [*found.translation]
-    assert json.loads(line)["rotation"] == [*found.rotation]
-
-
 def test_an_offset_counts_from_the_beginning_and_a_date_is_absolute(tmp_path: Path, tfbus: Command) -> None:
     start = 1_396_293_890 * SECOND
     lines = [(start + k * SECOND, "/tf", [moving("map", "base", start + k * SECOND, float(k))]) for k in range(5)]
@@ -280,12 +269,6 @@ def test_a_speed_limit_leaves_out_what_cannot_be(tmp_path: Path, tfbus: Command)
     )
     assert json.loads(done.stdout)["translation"] == [2.0, 0.0, 0.0]
     assert "1 x speed" in done.stderr
-
-
-def test_without_rows_nothing_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    for kind in ("table", "csv", "json", "tum"):
-        print_rows([], kind, several=False)
-    assert capsys.readouterr() == ("", "")
 
 
 def test_where_a_line_does_not_fit_the_quaternion_is_on_a_second_one(

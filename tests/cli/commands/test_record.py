@@ -12,7 +12,7 @@ from support.processes import TFBUS, Program, free_address, new_domain, start_tf
 from support.recorded import messages_in
 from support.samples import moving, static
 
-from tfbus import Bus, RecordingDropped, RecordingFailed, SystemClock, TransformStamped
+from tfbus import Bus, SystemClock, TransformStamped
 from tfbus.cli.commands.record import print_summary
 from tfbus.recording import open_recording
 from tfbus.statistics import QueueStatistics, RecorderStatistics
@@ -93,42 +93,6 @@ def test_the_summary_warns_of_lost_samples_and_lost_authorities(capsys: pytest.C
         "tfbus: 1,002 samples were lost, because the disk was too slow or failed",
         "tfbus: 1 samples are recorded without their authority: too many of them",
     ]
-
-
-def test_lost_samples_are_warned_of_and_a_failure_ends_it(tmp_path: Path, tfbus: Command) -> None:
-    async def fail(bus: Bus) -> None:
-        await until_recording()
-        bus._announce(RecordingDropped(bus.clock.now(), "run.mcap", 3))
-        await anyio.wait_all_tasks_blocked()
-        bus._announce(RecordingFailed(bus.clock.now(), "run.mcap", OSError("the disk is full")))
-        await anyio.sleep_forever()
-
-    done = tfbus.on_domain(fail, "record", tmp_path / "run.mcap", clock=SystemClock())
-    assert done.stderr.splitlines()[1] == "tfbus: the disk is too slow: samples are lost, 3 so far"
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_it_records_what_programs_on_the_domain_send(tmp_path: Path, backend: str) -> None:
-    path = tmp_path / "run.mcap"
-    domain, address = new_domain(), free_address()
-    options = ("--domain", domain, "--backend", backend)
-    with start_tfbus("record", str(path), "--listen", address, *options) as recorder:
-        recorder.errors.expect("recording")
-        with (
-            start_tfbus("static", "base_link", "camera", "--xyz", "0", "0", "1", "--connect", address, *options),
-            start_tfbus("broadcast", "--connect", address, *options),
-            start_tfbus("echo", "camera", "base_laser", "--rate", "10", "--connect", address, *options) as echo,
-        ):
-            for _ in range(3):
-                echo.output.expect("^At ")
-        assert recorder.end() == 130
-    samples = samples_in(path)
-    assert recorder.output.text == ""
-    assert recorder.errors.text.splitlines()[-1] == f"{len(samples):,} samples in {path}"
-    assert {(sample.parent, sample.child) for sample in samples if sample.static} == {("base_link", "camera")}
-    authorities = {(sample.child, sample.authority) for sample in samples if not sample.static}
-    assert authorities == {("base_laser", "robot_tf_publisher")}
 
 
 def test_an_existing_file_is_kept_unless_it_may_be_overwritten(tmp_path: Path, tfbus: Command) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from support import pr2
 from support.commands import START, Command, check_wrong_call, nobody
-from support.processes import free_address, new_domain, start_tfbus, until
+from support.processes import start_tfbus, until
 
 from tfbus import SECOND, Buffer, Bus, RobotModel, TransformStamped
 from tfbus.cli.commands import robot
@@ -207,18 +207,6 @@ def test_fixed_joints_are_published_once_and_the_others_at_the_rate(crane: str, 
     assert stamps == [{START}, {START + SECOND // 20}, {START + SECOND // 10}]
     assert {(sample.authority, sample.static) for batch in moving for sample in batch} == {("robot", False)}
     assert hooks == [pytest.approx((2.0 * math.cos(0.5), 2.0 * math.sin(0.5), 3.5))]
-
-
-@pytest.mark.thorough
-def test_other_programs_receive_the_frames_of_the_robot(crane: str) -> None:
-    options = ("--domain", new_domain())
-    address = free_address()
-    with start_tfbus("robot", crane, "rope=1.5", "--listen", address, *options) as robot:
-        with start_tfbus("echo", "base", "lamp", "--json", "--connect", address, *options) as echo:
-            assert json.loads(echo.output.expect("{"))["translation"] == [0.5, 0.0, 5.0]
-        assert robot.end() == 130
-    assert robot.output.text == ""
-    assert len(robot.errors.text.splitlines()) == 1
 
 
 def test_where_the_tree_does_not_fit_types_and_joints_go_and_mimics_are_shortened(crane: str) -> None:

@@ -3,21 +3,14 @@
 import errno
 import json
 import os
-import re
 import shutil
 from pathlib import Path
 
 import pytest
 from support.commands import START, Command, check_wrong_call
-from support.processes import free_address, new_domain, start_tfbus
 from support.samples import moving, static
 
 from tfbus import SECOND, Bus
-
-TREE = r"""base_link
-├── base_laser  \d+\.\d Hz  age .+  span .+  from 'robot_tf_publisher'
-└── camera      static  from 'tfbus static'
-"""
 
 
 async def publish(bus: Bus) -> None:
@@ -118,21 +111,6 @@ def test_a_file_that_cannot_be_written_is_one_line_and_status_2(tmp_path: Path, 
     check_wrong_call(
         tfbus.on_domain(publish, "tree", "--dot", nowhere), f"cannot write {nowhere}: {os.strerror(errno.ENOENT)}"
     )
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_it_shows_what_programs_on_the_domain_send(backend: str) -> None:
-    domain, address = new_domain(), free_address()
-    options = ("--domain", domain, "--backend", backend)
-    with start_tfbus("tree", "--duration", "1.5", "--listen", address, *options) as tree:
-        tree.errors.expect("waiting")
-        with (
-            start_tfbus("broadcast", "--connect", address, *options),
-            start_tfbus("static", "base_link", "camera", "--connect", address, *options),
-        ):
-            assert tree.wait() == 0
-    assert re.fullmatch(TREE, tree.output.text)
 
 
 def test_it_listens_until_each_frame_was_heard_twice_and_all_are_connected(tfbus: Command) -> None:

@@ -164,22 +164,6 @@ def test_either_program_may_be_killed_and_started_again(backend: str) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("command", "number", "status"),
-    [
-        ("broadcast", signal.SIGTERM, -signal.SIGTERM),
-        ("listen", signal.SIGTERM, -signal.SIGTERM),
-        ("listen", signal.SIGINT, 130),
-    ],
-)
-def test_a_signal_ends_it_at_once_and_silently(command: str, number: signal.Signals, status: int) -> None:
-    with start_tfbus(command, "--domain", new_domain()) as program:
-        greeting = program.errors.expect("broadcasting|waiting")
-        assert program.end(number) == status
-    assert program.errors.text == f"{greeting}\n"
-
-
-@pytest.mark.thorough
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("time", ["--simulated", "--duration=inf"])
 def test_ctrl_c_ends_the_demo_with_status_130_and_no_traceback(backend: str, time: str) -> None:
