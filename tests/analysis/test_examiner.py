@@ -1,4 +1,4 @@
-""""""
+"""Findings about streams of samples and about trees."""
 
 import math
 import random

@@ -1,4 +1,4 @@
-""""""
+"""Publishing the frames of a robot by the positions of its joints, and reading these from messages."""
 
 import logging
 import math

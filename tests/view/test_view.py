@@ -116,7 +116,7 @@ async def test_a_page_outlives_its_bus() -> None:
             assert (await client.get(view.address)).status_code == 200
 
 
-# What a browser is told, and what it can do
+# The page in a browser, and its controls
 
 
 async def test_what_happens_is_drawn_while_somebody_looks_and_nothing_listens_after_that(

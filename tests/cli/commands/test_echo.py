@@ -72,7 +72,7 @@ def test_a_missing_transform_is_reported_again_after_it_was_there(tfbus: Command
             await bus.clock.sleep(4.9)
 
     done = tfbus.on_domain(publish, "echo", "base", "laser", "--max-age", "0.5")
-    # Those of 101.5 s and 106.5 s are the first lookups that fail, a second later; the next ones fail silently.
+    # The lookups of 101.5 s and 106.5 s fail first, a second later; the next ones fail silently.
     assert [line.partition(" (")[0] for line in done.stderr.splitlines()] == [
         "waiting for 'laser' in 'base': frame 'laser': asked for 102.000 s, newest sample is 100.500 s",
         "waiting for 'laser' in 'base': frame 'laser': asked for 107.000 s, newest sample is 105.400 s",
@@ -152,19 +152,9 @@ def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
 
 
 def test_numbers_and_frames_are_on_lines_of_their_own_where_they_do_not_fit() -> None:
-    # The first line fits to the letter.
-    assert describe(MOVING, MOVING.stamp + SECOND // 4, 59).split("\n") == [
-        "At 1700000000.000000001 s, age 250 ms: 'base_link' in 'map'",
-        "- Translation: [1.000000, -2.000000, 0.500000] m",
-        "- Rotation: in quaternion (xyzw)",
-        "  [0.000000, 0.000000, -0.247404, 0.968912]",
-        "            in rpy (rad)",
-        "  [0.000000, 0.000000, -0.500000]",
-        "            in rpy (deg)",
-        "  [0.000000, 0.000000, -28.647890]",
-    ]
     long = MOVING.replace(child="a_frame_with_a_very_long_name_of_a_part_of_a_part_of_a_robot")
-    assert describe(long, MOVING.stamp, 50).split("\n")[1:3] == [
-        "  'a_frame_with_a_very_lo…rt_of_a_part_of_a_robot'",
-        "  in 'map'",
-    ]
+    for sample, width, lines in ((MOVING, 59, 8), (long, 50, 10)):
+        shown = describe(sample, MOVING.stamp + SECOND // 4, width).split("\n")
+        assert max(map(len, shown)) <= width
+        assert len(shown) == lines
+        assert "  [0.000000, 0.000000, -0.247404, 0.968912]" in shown

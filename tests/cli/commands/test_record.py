@@ -8,9 +8,9 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from support.commands import Command, check_wrong_call, nobody
-from support.processes import TFBUS, Program, free_address, new_domain, start_tfbus
+from support.processes import TFBUS, Program, free_address, new_domain, start_tfbus, until
 from support.recorded import messages_in
-from support.samples import moving, static
+from support.samples import moving, over, static
 
 from tfbus import Bus, SystemClock, TransformStamped
 from tfbus.cli.commands.record import print_summary
@@ -93,6 +93,20 @@ def test_the_summary_warns_of_lost_samples_and_lost_authorities(capsys: pytest.C
         "tfbus: 1,002 samples were lost, because the disk was too slow or failed",
         "tfbus: 1 samples are recorded without their authority: too many of them",
     ]
+
+
+@pytest.mark.thorough
+def test_lost_samples_are_warned_of(tmp_path: Path, tfbus: Command) -> None:
+    async def publish_too_many(bus: Bus) -> None:
+        await until(lambda: any(tmp_path.iterdir()))
+        await anyio.wait_all_tasks_blocked()
+        # A thousand more than the recorder holds, before it can write any.
+        for number in range(101):
+            bus.publish(over("map", "base", range(1_000 * number, 1_000 * number + 1_000)))
+        await anyio.wait_all_tasks_blocked()
+
+    done = tfbus.on_domain(publish_too_many, "record", tmp_path / "run.mcap", clock=SystemClock())
+    assert done.stderr.splitlines()[-1] == "tfbus: the disk is too slow: samples are lost, 1000 so far"
 
 
 def test_an_existing_file_is_kept_unless_it_may_be_overwritten(tmp_path: Path, tfbus: Command) -> None:

@@ -91,7 +91,7 @@ def test_the_tree_has_frames_joints_types_and_positions(
     ("old", "new", "arguments", "line"),
     [
         ('name="swing"', 'name="s=w"', ("s=w=1",), "├── boom      s=w     revolute   1 rad"),
-        # What mimics a joint that cannot move has no position.
+        # A joint that mimics a fixed joint has no position.
         ('name="rope" type="prismatic"', 'name="rope" type="fixed"', (), "├── shadow    follow  prismatic"),
     ],
 )

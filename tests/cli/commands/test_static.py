@@ -6,7 +6,6 @@ from pathlib import Path
 import anyio.lowlevel
 import pytest
 from support.commands import START, Command, check_wrong_call
-from support.processes import new_domain, start_tfbus
 
 from tfbus import Bus, Transform, TransformStamped
 
@@ -51,23 +50,6 @@ def test_it_publishes_one_static_transform_for_everybody_until_ctrl_c(
     assert (sample.parent, sample.child, sample.stamp) == ("base_link", "laser", START)
     assert (sample.authority, sample.static) == (authority, True)
     assert sample.transform.is_close(transform)
-
-
-@pytest.mark.thorough
-def test_it_may_be_killed_and_started_again_with_other_numbers() -> None:
-    domain = new_domain()
-    with start_tfbus("static", "base_link", "laser", "--xyz", "0.1", "-2", ".5", "--domain", domain) as static:
-        static.errors.expect("publishing")
-        with start_tfbus("echo", "base_link", "laser", "--rate", "20", "--json", "--domain", domain) as echo:
-            first = json.loads(echo.output.expect("{"))
-            static.process.kill()
-            turned = ("--rpy", "0", "0", str(math.pi / 2), "--domain", domain)
-            with start_tfbus("static", "base_link", "laser", *turned):
-                second = json.loads(echo.output.expect(r'"translation": \[0\.0, 0\.0, 0\.0\]'))
-    assert (first["target"], first["source"], first["static"]) == ("base_link", "laser", True)
-    assert (first["translation"], first["rotation"]) == ([0.1, -2.0, 0.5], [0.0, 0.0, 0.0, 1.0])
-    assert second["rotation"] == pytest.approx(TURNED)
-    assert static.output.text == ""
 
 
 @pytest.mark.parametrize(
