@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from support.commands import Command, check_wrong_call
 from support.processes import PATIENCE, TFBUS, Program, new_domain
-from support.recorded import SMALL, write_mcap
+from support.recorded import write_mcap
 from support.samples import moving
 
 from tfbus import Bus, kernel
@@ -108,11 +108,7 @@ def test_completion_is_written_for_a_shell_with_all_commands(
         (("tree", "--no-such-option"), "--no-such-option"),
         (("tree", "surplus"), "surplus"),
         (("info",), "FILE"),
-        (("info", SMALL, SMALL), str(SMALL)),
         (("echo", "map"), "SOURCE"),
-        (("demo", "--rate", "0"), "--rate"),
-        (("demo", "--listen-rate=-1"), "--listen-rate"),
-        (("record", "a.mcap", "--duration", "-1"), "--duration"),
         (("listen", "--backend", "curio"), "--backend"),
         (("broadcast", "--listen", "rubbish"), "an address is like tcp/192.168.1.5:7447, not 'rubbish'"),
         (("static", "map", "odom", "--domain", "a b"), "a domain is made of letters"),

@@ -8,6 +8,7 @@ import os
 import re
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -167,31 +168,30 @@ COLUMNS = (Column("name"), Column("least", importance=1), Column("count", right=
 ROWS = [("a", "xyz", "1"), ("long name", "w", "1,000")]
 
 
-def test_columns_are_as_wide_as_their_cells_and_numbers_stand_at_the_right() -> None:
-    assert list(table_lines(COLUMNS, ROWS, None)) == [
-        "name       least  count",
-        "a          xyz        1",
-        "long name  w      1,000",
-    ]
-    assert list(table_lines(COLUMNS, ROWS, 23)) == list(table_lines(COLUMNS, ROWS, None))
+LINKS = [("left_shoulder_link", "fixed"), ("arm", "revolute")]
+WHOLE = ["name       least  count", "a          xyz        1", "long name  w      1,000"]
 
 
-def test_the_least_important_columns_go_first_where_they_do_not_fit() -> None:
-    assert list(table_lines(COLUMNS, ROWS, 22)) == ["name       count", "a              1", "long name  1,000"]
-    assert list(table_lines(COLUMNS, ROWS, 15)) == ["name", "a", "long name"]
-
-
-def test_columns_that_stay_always_are_shortened_but_to_eight_columns_at_least() -> None:
-    columns = (Column("name"), Column("kind"))
-    rows = [("left_shoulder_link", "fixed"), ("arm", "revolute")]
-    assert list(table_lines(columns, rows, 20)) == ["name        kind", "left…_link  fixed", "arm         revolute"]
-    assert list(table_lines(columns, rows, 3))[1] == "lef…link  fixed"
-
-
-def test_empty_columns_and_titles_are_left_out_and_wide_letters_take_two_columns() -> None:
-    assert list(table_lines(COLUMNS, [("a", "", "1")], None)) == ["name  count", "a         1"]
-    assert list(table_lines(COLUMNS, [], None, titles=False)) == []
-    assert list(table_lines(COLUMNS[::2], [("雷达", "1"), ("abcd", "2")], None, titles=False)) == ["雷达  1", "abcd  2"]
+@pytest.mark.parametrize(
+    ("columns", "rows", "width", "titles", "lines"),
+    [
+        (COLUMNS, ROWS, None, True, WHOLE),
+        (COLUMNS, ROWS, 23, True, WHOLE),
+        # The least important columns go first; the others are shortened, but to eight columns at least.
+        (COLUMNS, ROWS, 22, True, ["name       count", "a              1", "long name  1,000"]),
+        (COLUMNS, ROWS, 15, True, ["name", "a", "long name"]),
+        (COLUMNS[:1] * 2, LINKS, 20, False, ["left…_link  fixed", "arm         revolute"]),
+        (COLUMNS[:1] * 2, LINKS, 3, False, ["lef…link  fixed", "arm       revolute"]),
+        # A column without cells is left out, and a wide letter takes two columns.
+        (COLUMNS, [("a", "", "1")], None, True, ["name  count", "a         1"]),
+        (COLUMNS, [], None, False, []),
+        (COLUMNS[::2], [("雷达", "1"), ("abcd", "2")], None, False, ["雷达  1", "abcd  2"]),
+    ],
+)
+def test_a_table_has_the_columns_that_fit_with_numbers_at_the_right(
+    columns: Sequence[Column], rows: list[tuple[str, ...]], width: int | None, titles: bool, lines: list[str]
+) -> None:
+    assert list(table_lines(columns, rows, width, titles)) == lines
 
 
 def test_the_bar_is_on_standard_error_and_leaves_the_output_alone(

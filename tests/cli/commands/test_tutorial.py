@@ -71,16 +71,6 @@ def test_on_the_system_clock_the_lines_have_the_time_of_the_system(tfbus: Comman
 
 
 @pytest.mark.anyio
-async def test_the_point_follows_the_transform() -> None:
-    clock = SimulatedClock()
-    with Bus(clock) as bus, Buffer(bus) as buffer:
-        TransformBroadcaster(bus).send("base_link", "base_laser", Transform((0.0, 0.0, 5.0)))
-        lines: list[str] = []
-        await simulate(clock, lambda: tutorial.transform_points(buffer, lines=1, output=lines.append))
-    assert "base_link: (1.00, 0.20, 5.00)" in lines[0]
-
-
-@pytest.mark.anyio
 async def test_a_transform_that_the_bus_refuses_is_logged_once_and_the_next_ones_are_sent(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
