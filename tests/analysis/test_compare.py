@@ -1,4 +1,4 @@
-""""""
+"""Errors of one trajectory against another, by closed forms and by evo."""
 
 import math
 from dataclasses import astuple

@@ -113,15 +113,6 @@ def test_the_selected_frame_is_described_and_marked_in_the_tree() -> None:
     assert texts(page).tree.count("background") == 0
 
 
-def test_the_search_finds_parts_of_names_in_any_case() -> None:
-    page = Page(driven())
-    assert texts(page).matches == texts(page).frames == ("base", "lidar", "map")
-    page.search = "A"
-    assert texts(page).matches == ("base", "lidar", "map")
-    page.search = "DAR"
-    assert texts(page).matches == ("lidar",)
-
-
 def test_the_newest_events_come_first_and_the_oldest_are_forgotten() -> None:
     page = Page(driven())
     assert "none so far" in texts(page).events

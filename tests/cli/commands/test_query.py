@@ -92,11 +92,6 @@ def test_the_table_has_no_negative_zeros(tmp_path: Path, tfbus: Command) -> None
     assert line.split()[1:] == ["0.000000"] * 6 + ["1.000000"]
 
 
-def test_a_static_transform_is_one_row(recording: Path, tfbus: Command) -> None:
-    done = tfbus("query", recording, "base", "laser", "--every", "0.1", "--csv")
-    assert [line.split(",")[1] for line in done.stdout.splitlines()] == ["x", "100.0"]
-
-
 @pytest.mark.parametrize(
     ("every", "rows", "left_out"),
     # A chunk of instants covers two seconds of the second one.
