@@ -56,7 +56,7 @@ BOXES += [moving("b", "box", k * 100 * MS, 500.0) for k in range(30, 60)]
 @pytest.mark.parametrize(
     ("samples", "options", "expected"),
     [
-        # Of two places that cannot be, neither is a jump.
+        # A place that cannot be is no jump.
         (placed(drive(), {40: 1e32, 50: 1e9}), {}, {("translation", "base"): (2, 4 * SECOND, 1e32, 4 * SECOND)}),
         # From 0.1 m/s to 3 m/s and back: far beyond the usual speed, and far below the bound.
         (placed(drive(speed=0.1), {40: 0.7}), {}, {("jump", "base"): (2, 4 * SECOND, 3.1, 4 * SECOND)}),

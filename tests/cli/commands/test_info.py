@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from support.commands import Command, check_wrong_call
-from support.recorded import SMALL, WRONG_IN_SMALL, Line, real, write_mcap
+from support.recorded import SMALL, WRONG_IN_SMALL, Line, write_mcap
 from support.samples import moving, static
 
 
@@ -70,14 +70,6 @@ def test_json_has_all_digits(tfbus: Command) -> None:
         "delay": {"mean": pytest.approx(0.002), "p99": 0.002, "max": 0.002},
     }
     assert frames["laser"]["oldest"] is None
-
-
-def test_the_date_and_the_senders_of_a_real_recording_are_shown(tfbus: Command) -> None:
-    done = tfbus("info", real("turtlesim.bag"), "--wide")
-    assert "start     1396293887.844783943 s  2014-03-31 19:24:47 UTC" in done.stdout
-    assert rows_of(done.stdout)["turtle1"] == [
-        "world", "moving", "1,344", "62.5 Hz", "21.5 s", "16.2 ms", "turtle1_tf_broadcaster"
-    ]  # fmt: skip
 
 
 def test_names_are_no_markup_and_not_cut_where_the_output_is_no_terminal(tmp_path: Path, tfbus: Command) -> None:
