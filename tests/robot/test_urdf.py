@@ -169,9 +169,7 @@ def test_the_error_names_the_malformed_element(parts: str, message: str, capfd: 
     ("text", "message"),
     [
         ("<robot", "it is not well-formed XML: unclosed token: line 1, column 0"),
-        ('<robot name="r"><link name="a"></robot>', "it is not well-formed XML: mismatched tag: line 1, column 33"),
         ('<robot name="r"><x:link name="a"/></robot>', "it is not well-formed XML: unbound prefix"),
-        ('<robot name="r">\x00</robot>', "it is not well-formed XML: "),
         ('<?xml version="1.0" encoding="none-such"?><robot/>', "in <robot>: Required attribute not set in XML: name"),
         ("<robot/>\ud800", "it is not well-formed XML: "),
         ("<sdf version='1.6'/>", "a URDF is a <robot>, but this is a <sdf>"),

@@ -139,8 +139,6 @@ def test_remote_transforms_come_from_the_buffer_of_another_program() -> None:
         (("map", "/base_link"), "write 'base_link'"),
         (("", "base_link"), "must not be empty"),
         (("map",), "SOURCE"),
-        (("map", "base_link", "--rate", "0"), "--rate"),
-        (("map", "base_link", "--max-age=-1"), "--max-age"),
         (("map", "base_link", "--remote", "--robots", "r1", "--robots", "r2"), "one robot"),
         (("map", "base_link", "--remote", "--robots", "a/b"), "robot"),
     ],

@@ -180,13 +180,10 @@ def test_others_follow_the_clock_of_the_recording(ten_seconds: Path, backend: st
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
-        (("--rate", "0"), "--rate"),
-        (("--rate", "nan"), "--rate"),
         (("--from=-1",), "expected a time from the beginning on"),
         (("--from", "10.1"), "is 10.000 s long"),
         (("--from", "5", "--to", "4.9"), "--to must not be before --from"),
         (("--to", "1970-01-01"), "--to must not be before"),
-        (("--from", "soon"), "expected seconds"),
     ],
 )
 def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(

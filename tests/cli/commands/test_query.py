@@ -152,12 +152,8 @@ def test_edges_that_never_overlap_are_a_failed_lookup(tmp_path: Path, tfbus: Com
         (("--topic", "/a", "--namespaces"), "give one of them"),
         (("--stamps-of", "/nothing"), "nothing is on topic"),
         (("--at", "1", "--every", "1"), "give one of them"),
-        (("--at", "noon"), "expected seconds, not 'noon'"),
-        (("--at", "1.0000000001"), "more than nine decimals"),
         (("--every", "0"), "more than 0 s"),
-        (("--every=-1",), "more than 0 s"),
         (("--every", "0.000000001"), "there would be 10,000,000,001 lines"),
-        (("--unknown",), "--unknown"),
     ],
 )
 def test_a_wrong_call_is_one_line_and_status_2(
