@@ -466,6 +466,7 @@ def test_invalid_arguments_are_refused_at_once(arguments: dict[str, object], err
         ("points", {}, TypeError),
         (np.zeros((2, 3)), {}, TypeError),
         (PointCloud("map", LATEST, np.zeros((2, 3))), {"size": 0.0}, ValueError),
+        (PointCloud("map", LATEST, np.zeros((2, 3))), {"size": "big"}, TypeError),
         (PointCloud("map", LATEST, np.zeros((2, 3))), {"colour": (1, 2)}, ValueError),
         (PointCloud("map", LATEST, np.zeros((2, 3))), {"colour": np.zeros((3, 3), int)}, ValueError),
         (PointCloud("map", LATEST, np.zeros((2, 3))), {"colour": (0.5, 0.5, 0.5)}, TypeError),

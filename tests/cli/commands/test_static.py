@@ -64,7 +64,7 @@ def test_it_publishes_one_static_transform_for_everybody_until_ctrl_c(
         (("/a", "b"), "write 'a'"),
         (("", "b"), "must not be empty"),
         (("a", "\udcff"), "UTF-8"),
-        (("a",), "CHILD"),
+        (("a", "--xyz", "1", "2", "3"), "CHILD"),
         (("a", "b", "c"), "'c'"),
         (("a", "b", "--rpy", "0", "0", "1", "--rpy-deg", "0", "0", "1"), "--rpy and --rpy-deg"),
         (("a", "b", "--rpy-deg", "0", "nan", "0"), "not finite"),
