@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import anyio
 import pytest
 from anyio.abc import TaskGroup
-from hypothesis import HealthCheck, example, event, given, settings
+from hypothesis import HealthCheck, event, example, given, settings
 from hypothesis import strategies as st
 
 from tfbus import (

@@ -16,7 +16,7 @@ from typing import Any
 import anyio
 import anyio.lowlevel
 import pytest
-from support.processes import PATIENCE, TFBUS
+from support.processes import TFBUS
 
 from tfbus import SECOND, Bus, Clock, SimulatedClock
 from tfbus.testing import simulate
@@ -136,26 +136,6 @@ def open_terminal() -> tuple[int, int]:
     pty: Any = pytest.importorskip("pty", reason="this system has no pseudo-terminals")
     ends: tuple[int, int] = pty.openpty()
     return ends
-
-
-def on_a_terminal(output: Path, *arguments: str) -> tuple[int, str]:
-    """Run ``tfbus`` with standard error on a terminal and standard output in a file.
-
-    Returns
-    -------
-    The exit status, and what the terminal received.
-    """
-    ours, theirs = open_terminal()
-    environment = {**os.environ, "TERM": "xterm"}
-    with os.fdopen(ours, "rb", buffering=0) as terminal, output.open("wb") as file:
-        process = subprocess.Popen([TFBUS, *arguments], stdout=file, stderr=theirs, env=environment)
-        os.close(theirs)
-        received = b""
-        # At the end of the program, Linux raises an error.
-        with suppress(OSError):
-            while part := terminal.read(4_096):
-                received += part
-        return process.wait(timeout=PATIENCE), received.decode()
 
 
 def lines_on_a_terminal(width: int, *arguments: str | Path, seconds: float | None = None) -> list[str]:

@@ -233,10 +233,6 @@ class Browser:
         control.fill(text)
         control.press("Enter")
 
-    def press(self, name: str) -> None:
-        """Press the button of a name."""
-        self.page.get_by_role("button", name=name, exact=True).click()
-
     def click_in_the_middle(self) -> None:
         """Click in the middle of the 3D part."""
         box = self.page.locator("canvas").first.bounding_box()
