@@ -20,6 +20,7 @@ from wsproto.events import (
     CloseConnection,
     Event,
     Ping,
+    Pong,
     RejectConnection,
     Request,
     TextMessage,
@@ -60,6 +61,14 @@ class RosbridgeServer:
 
     Attributes
     ----------
+    requests : list of dict
+        All that clients have asked for, each with the time of the loop as ``"at"``.
+    attempts : list of tuple
+        The path of each attempt to connect, and the time of the loop.
+    pongs : list of bytes
+        The answers to its pings.
+    absent, silent, only_sends : bool
+        Whether it refuses to talk, answers nothing, or sends without reading.
     refuses : set of str
         Topics that it lets nobody advertise or publish to, without a word.
     """
@@ -68,8 +77,11 @@ class RosbridgeServer:
         self.encodings = encodings
         self.clients: list[Client] = []
         self.requests: list[dict[str, Any]] = []
+        self.attempts: list[tuple[str, float]] = []
+        self.pongs: list[bytes] = []
         self.latched: dict[str, tuple[TransformStamped, ...]] = {}
         self.port = 0
+        self.absent = False
         self.silent = False
         self.only_sends = False
         self.refuses: set[str] = set()
@@ -123,14 +135,16 @@ class RosbridgeServer:
                 while True:
                     while self.only_sends:
                         await client.send(TextMessage("{}"))
-                        await anyio.sleep(0.01)
+                        await anyio.sleep(0.5)
                     client.connection.receive_data(await stream.receive())
                     for event in client.connection.events():
                         if self.silent:
                             continue
                         if isinstance(event, Request):
-                            refused = event.target == "/refused"
-                            await client.send(RejectConnection(status_code=404) if refused else AcceptConnection())
+                            self.attempts.append((event.target, anyio.current_time()))
+                            await client.send(RejectConnection(status_code=404) if self.absent else AcceptConnection())
+                        elif isinstance(event, Pong):
+                            self.pongs.append(bytes(event.payload))
                         elif isinstance(event, Ping | CloseConnection):
                             await client.send(event.response())
                         elif isinstance(event, TextMessage):
@@ -144,7 +158,7 @@ class RosbridgeServer:
             self.clients.remove(client)
 
     async def answer(self, client: Client, request: dict[str, Any]) -> None:
-        self.requests.append(request)
+        self.requests.append({**request, "at": anyio.current_time()})
         topic = request["topic"]
         if request["op"] == "subscribe":
             client.subscriptions[topic] = request["compression"]

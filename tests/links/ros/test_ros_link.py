@@ -271,10 +271,10 @@ def test_frames_that_were_lost_with_their_peer_come_back_as_they_were() -> None:
 
 def test_static_frames_can_be_sent_once_more() -> None:
     end = RosEnd()
-    end.carrier._publish_statics()
+    end.carrier.publish_statics()
     assert end.carrier.said == []
     end.say(static("map", "lidar"))
-    end.carrier._publish_statics()
+    end.carrier.publish_statics()
     assert end.carrier.said == [(True, [("map", "lidar", 0)])] * 2
 
 
