@@ -1,6 +1,10 @@
+import struct
+from contextlib import suppress
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support.joint_messages import joint_state
 from support.samples import moving, static
 
@@ -67,3 +71,11 @@ def test_the_nodes_of_a_participant_are_read_as_the_library_writes_them() -> Non
 def test_a_false_count_of_publishers_ends_at_once() -> None:
     with pytest.raises(ValueError, match="4294967295 entries in 4 bytes"):
         RawEntitiesInfo.deserialize(b"\0\1\0\0" + bytes(16) + b"\xff" * 4 + bytes(4)).read()
+
+
+@given(st.binary(max_size=100), st.binary(max_size=8), st.integers(0, 100))
+def test_garbage_has_names_of_nodes_or_is_told(rest: bytes, changed: bytes, at: int) -> None:
+    good = b"\0\1\0\0" + bytes(16) + struct.pack("<II2s2xI2s2xII", 1, 2, b"/\0", 2, b"a\0", 0, 1) + bytes(16)
+    for payload in (rest, good[:at] + changed + good[at + len(changed) :], good[:at] + rest):
+        with suppress(ValueError, struct.error):
+            RawEntitiesInfo.deserialize(payload).read()
