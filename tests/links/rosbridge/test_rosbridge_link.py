@@ -97,11 +97,12 @@ async def test_garbage_is_counted_by_reason_and_ends_nothing() -> None:
                 other = {"op": "publish", "topic": "/other", "msg": {}}
                 bad = {"op": "publish", "topic": "/tf", "msg": {"transforms": [{}]}}
                 raw = {"op": "publish", "topic": "/tf", "msg": {"bytes": b"\x05\0\0\0"}}
-                await server.say_anything("nonsense", b"\xff", "[" * 10_000, json.dumps(other), json.dumps(bad))
-                await server.say_anything(cbor2.dumps(raw), json.dumps({"op": "status", "msg": "hm"}))
+                no_messages = ("", "[1]", "nonsense", "5", b"\xff", b"\x05", "[" * 100_000, b"\x81" * 100_000)
+                await server.say_anything(*no_messages, json.dumps(other), json.dumps(bad), cbor2.dumps(raw))
+                await server.say_anything(json.dumps({"op": "status", "msg": "hm"}))
                 await server.say(moving("map", "base", 5))
                 await until(lambda: link.statistics().received_samples == 1)
-                assert link.statistics().rejected == {"encoding": 4, "topic": 1, "truncated": 1}
+                assert link.statistics().rejected == {"encoding": 9, "topic": 1, "truncated": 1}
 
 
 TINY = {
