@@ -245,6 +245,7 @@ async def test_names_of_nodes_that_cannot_be_read_are_malformed_and_spoil_no_oth
     [
         # Another writer has come between the two calls that the library makes for this.
         ("get_matched_publications", IndexError("invalid index"), set()),
+        ("get_matched_publications", RuntimeError("once"), {"not read"}),
         # A stranger has given its writer such a name.
         ("get_matched_publication_data", UnicodeDecodeError("utf-8", b"\xff", 0, 1, "x" * 1_000), {"not read"}),
         ("take", ValueError("once"), {"not read"}),

@@ -259,31 +259,6 @@ def test_a_thread_that_has_ended_has_let_go_of_its_readers(domain_number: int) -
         assert gone() is None
 
 
-def test_data_are_taken_though_the_writers_cannot_be_read_and_these_are_read_again(domain_number: int) -> None:
-    taken, matched = list[str](), Turns()
-
-    def match(reader: DataReader[Any]) -> float | None:
-        matched.add(len(reader.get_matched_publications()))
-        if len(matched.told) < 3:
-            raise IndexError("invalid index")
-        return None
-
-    def take(reader: DataReader[Any]) -> bool:
-        taken.extend(texts(reader, 1))
-        return len(taken) < 3
-
-    with watched(domain_number) as end:
-        end.thread.watch(end.reader, take, match)
-        for text in "abc":
-            end.writer.write(RawString(text))
-        end.thread.start()
-        matched.wait_for(3)
-        end.thread.stop()
-        # One event told of all three, and nothing came after it.
-        assert taken == ["a", "b", "c"]
-        assert (matched.told, end.errors) == ([1, 1, 1], ["invalid index"] * 2)
-
-
 def test_only_what_is_served_wakes_the_thread(domain_number: int) -> None:
     with watched(domain_number) as end:
         end.thread.watch(end.reader, bool)

@@ -19,6 +19,7 @@ import zenoh
 import zenoh.ext
 from rosbags.typesys import Stores, get_typestore
 from support.both_sides import SECONDS, Node, Program, meet, node
+from support.damage import damaged
 from support.joint_messages import joint_state
 from support.processes import free_ports, until
 from support.samples import moving, static
@@ -50,8 +51,7 @@ pytestmark = pytest.mark.anyio
 PEER = Path(__file__).parents[2] / "support" / "rmw_zenoh_peer.py"
 DOMAIN = 7
 BLOCK = zenoh.CongestionControl.BLOCK
-NAMES = [b"\xff\xfe", b"a\0b", b"\n\x1b[2J", b"///"]
-NUMBERS = [math.nan, math.inf, -1e308, 1e13]
+PIECES = [struct.pack("<I", number) for number in (0, 1, 2, 2**16, 2**31, 2**32 - 1)] + [bytes(1_000)]
 TF_KEY = f"{DOMAIN}/tf/tf2_msgs::msg::dds_::TFMessage_/{HASH}"
 TF_STATIC_KEY = f"{DOMAIN}/tf_static/tf2_msgs::msg::dds_::TFMessage_/{HASH}"
 TEXT = b"\0\1\0\0" + struct.pack("<I", 9) + b"<robot/>\0"
@@ -397,28 +397,6 @@ async def test_a_session_that_does_not_close_in_time_is_told(
         assert "it goes on" in caplog.text
 
 
-def mutated(random: Random, message: bytes) -> bytes:
-    """A message with some of its bytes changed, cut, or put in."""
-    data = bytearray(message)
-    for _ in range(random.randint(1, 3)):
-        at = random.randrange(len(data) + 1)
-        match random.randrange(6):
-            case 0:
-                data[at : at + 1] = random.randbytes(1)
-            case 1:
-                data[at - at % 4 : at - at % 4 + 4] = struct.pack("<I", random.choice([0, 1, 2**16, 2**31, 2**32 - 1]))
-            case 2:
-                del data[at:]
-            case 3:
-                data[at:at] = random.randbytes(random.choice([1, 8, 1_000]))
-            case 4 if (place := data.find(struct.pack("<d", 1.5))) >= 0:
-                data[place : place + 8] = struct.pack("<d", random.choice(NUMBERS))
-            case _ if (place := data.find(b"frame")) >= 0:
-                name = random.choice(NAMES)
-                data[place : place + len(name)] = name
-    return bytes(data)
-
-
 @pytest.mark.parametrize("cases", [300, pytest.param(10_000, marks=pytest.mark.thorough)])
 async def test_no_damaged_message_attachment_or_key_ends_a_link_and_each_is_counted_or_heard(
     cases: int, caplog: pytest.LogCaptureFixture
@@ -428,6 +406,10 @@ async def test_no_damaged_message_attachment_or_key_ends_a_link_and_each_is_coun
     heard: set[str] = set()
     taken: list[Any] = []
     transforms = [encode([moving("map", f"frame{number}", 5, 1.5) for number in range(size)]) for size in (1, 3, 400)]
+    for name in (b"\xff\xfe", b"a\0b", b"\n\x1b[2J", b"///"):
+        transforms.append(transforms[1].replace(b"frame0", name.ljust(6, b"/")))
+    for number in (math.nan, math.inf, -1e308, 1e13):
+        transforms.append(transforms[1].replace(struct.pack("<d", 1.5), struct.pack("<d", number)))
     good = {
         f"tf/{TYPE}/{HASH}": transforms,
         f"tf_static/{TYPE}/{HASH}": transforms[:2],
@@ -452,12 +434,16 @@ async def test_no_damaged_message_attachment_or_key_ends_a_link_and_each_is_coun
             session = await anyio.to_thread.run_sync(zenoh.open, configuration(address, {}))
             attachment = pack(Attachment(1, 2, b"a publisher of 16"[:16]))
 
+            def hurt(message: bytes) -> bytes:
+                return damaged(random, message, PIECES)
+
             def storm() -> None:
                 for _ in range(cases):
                     key, payloads = random.choice(list(good.items()))
                     key = random.choice([key, key, key, key.rpartition("/")[0] + "/x", key + "/x", "tf/x/y"])
-                    with_it = random.choice([attachment, None, mutated(random, attachment), b"", bytes(100_000)])
-                    payload = mutated(random, random.choice(payloads))
+                    with_it = random.choice([attachment, None, hurt(attachment), b"", bytes(100_000)])
+                    payload = random.choice(payloads)
+                    payload = random.choice([payload, hurt(payload), hurt(payload)])
                     session.put(f"{DOMAIN}/{key}", payload, attachment=with_it, congestion_control=BLOCK)
                     session.delete(f"{DOMAIN}/{key}")
                 session.put(f"{DOMAIN}/tf/{TYPE}/{HASH}", bytes(5_000_000))

@@ -146,13 +146,10 @@ def test_what_comes_from_ros_has_the_node_as_its_authority_and_the_kind_of_its_t
     # Nor is an empty message anything.
     end.hear()
     assert (len(end.heard), end.endpoint.inbox.messages) == (3, 4)
-
-
-def test_the_authority_of_all_that_comes_in_may_be_given() -> None:
+    # An authority may be given.
     end = RosEnd(authority="robot")
     end.hear(moving("map", "base", 5))
-    end.hear(static("map", "lidar"), static=True)
-    assert [batch[0].authority for batch in end.heard] == ["robot", "robot"]
+    assert end.heard == [(moving("map", "base", 5, authority="robot"),)]
 
 
 def test_what_the_bus_refuses_is_counted_by_reason_and_announced_once_and_the_rest_is_published() -> None:
@@ -280,15 +277,6 @@ def test_after_a_jump_back_of_the_clock_the_stamps_of_before_are_news() -> None:
         end.hear(static("map", "lidar", 2.0), static=True)
         assert len(end.heard) == 2 + jumps
         end.endpoint.clock_jumped_back()
-
-
-def test_no_cut_message_is_published_or_raises() -> None:
-    end = RosEnd()
-    whole = encode([moving("map", "base", 5)])
-    for size in range(len(whole) - 8):
-        end.hear_bytes(whole[:size])
-    assert end.heard == []
-    assert sum(end.endpoint.peers.rejected.values()) == len(whole) - 8
 
 
 def test_positions_of_joints_are_handed_on_and_what_comes_of_that_is_counted() -> None:

@@ -11,6 +11,7 @@ pytest.importorskip("cbor2", reason='pip install "tfbus[rosbridge]"')
 import anyio
 import anyio.lowlevel
 import cbor2
+from support.damage import damaged
 from support.processes import until
 from support.rosbridge import install_roslib, rosbridge_server, roslib_client
 from support.samples import moving, static
@@ -134,22 +135,8 @@ async def test_tens_of_thousands_of_tiny_frames_share_the_event_loop_with_others
                 await until(lambda: link.statistics().received_samples == 1)
 
 
-def mutated(random: Random, message: bytes) -> bytes:
-    """A message with some bytes changed, cut, doubled, or replaced by pieces that decoders do not like."""
-    nasty = [b"\xff", b"\x9b", b"\xbb", b"\xdb", b"\xc2", b"\x5f", b"\xfb\x7f\xf0"]
-    nasty += [b"[", b"{", b'"', b"1" * 5_000, b"NaN", b"1e999"]
-    for _ in range(random.randint(1, 4)):
-        at, end = sorted(random.choices(range(len(message) + 1), k=2))
-        message = random.choice(
-            [
-                message[:at] + random.choice(nasty) + message[at:],
-                message[:at] + random.choice(nasty) * random.randint(1, 300) + message[end:],
-                message[:at] + random.randbytes(random.randint(1, 8)) + message[at + 1 :],
-                message[:at],
-                message[:at] + message[at:end] * 2 + message[end:],
-            ]
-        )
-    return message
+PIECES = [b"\xff", b"\x9b", b"\xbb", b"\xdb", b"\xc2", b"\x5f", b"\xfb\x7f\xf0"]
+PIECES += [b"[", b"{", b'"', b"1" * 5_000, b"NaN", b"1e999"]
 
 
 @pytest.mark.parametrize("cases", [150, pytest.param(5_000, marks=pytest.mark.thorough)])
@@ -167,7 +154,7 @@ async def test_no_damaged_message_ends_a_link_and_each_is_counted_or_heard(cases
             async with RosbridgeLink(bus, server.url, max_frames=10**6) as link:
                 await until(lambda: len(server.operations("subscribe")) == 2)
                 for number in range(cases):
-                    content = mutated(random, good[number % 3])
+                    content = damaged(random, good[number % 3], PIECES)
                     as_text = number % 3 == 0
                     await server.say_anything(content.decode(errors="replace") if as_text else content)
                 await server.say(moving("map", "last", 5))
@@ -259,11 +246,12 @@ async def test_beyond_its_capacity_a_link_drops_what_comes_again_and_nothing_tha
                 await until(lambda: len(server.operations("subscribe")) == 3)
                 (client,) = server.clients
                 described = {"op": "publish", "topic": "/robot_description", "msg": {"data": "<robot/>"}}
-                messages = [
+                news = [server.encoded("/tf", (moving("map", "base", stamp),), "none") for stamp in range(50)]
+                kept = [
                     TextMessage(json.dumps(described)),
                     server.encoded("/tf_static", (static("map", "lidar"),), "none"),
-                    *(server.encoded("/tf", (moving("map", "base", stamp),), "none") for stamp in range(50)),
                 ]
+                messages = [*news[:25], *kept, *news[25:]]
                 # All in one read.
                 await client.stream.send(b"".join(map(client.connection.send, messages)))
                 await until(lambda: link.statistics().queue.dropped > 0)
