@@ -6,13 +6,14 @@ import subprocess
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Unpack
 
 import anyio
 import anyio.abc
 import anyio.to_thread
 import cbor2
 import pytest
+from support.processes import until
 from wsproto import ConnectionType, WSConnection
 from wsproto.events import (
     AcceptConnection,
@@ -27,8 +28,11 @@ from wsproto.events import (
 )
 from wsproto.utilities import LocalProtocolError
 
-from tfbus import TransformStamped
+from tfbus import Bus, TransformStamped
+from tfbus.links.ros import RosOptions
 from tfbus.links.ros.messages import as_mapping, decode_mapping
+from tfbus.links.rosbridge import RosbridgeLink
+from tfbus.links.rosbridge.rosbridge_link import Encoding
 from tfbus.tf_message import encode
 
 _GONE = (anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError, LocalProtocolError)
@@ -180,6 +184,38 @@ async def rosbridge_server(encodings: tuple[str, ...] = ("cbor-raw", "cbor")) ->
         tasks.start_soon(listener.serve, server.handle)
         yield server
         tasks.cancel_scope.cancel()
+
+
+class Joined(NamedTuple):
+    """A link that has joined a server."""
+
+    server: RosbridgeServer
+    bus: Bus
+    link: RosbridgeLink
+
+    def not_sent(self) -> dict[str, int]:
+        return dict(self.link.statistics().not_sent)
+
+    def published(self, topic: str) -> list[dict[str, Any]]:
+        """The transforms that the server has got on a topic."""
+        said = [each for each in self.server.requests if each["op"] == "publish" and each["topic"] == topic]
+        return [row for each in said for row in each["msg"]["transforms"]]
+
+    def times(self, operation: str, topic: str) -> list[float]:
+        """When the server got some requests."""
+        return [each["at"] for each in self.server.requests if (each["op"], each["topic"]) == (operation, topic)]
+
+
+@asynccontextmanager
+async def joined(
+    encodings: tuple[str, ...] = ("cbor-raw", "cbor"), encoding: Encoding = "cbor", **options: Unpack[RosOptions]
+) -> AsyncIterator[Joined]:
+    """A link of a bus of its own that sends, when the server has got its requests."""
+    async with rosbridge_server(encodings) as server:
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url, encoding=encoding, **options) as link:
+                await until(lambda: len(server.operations("advertise")) == 1)
+                yield Joined(server, bus, link)
 
 
 # A client of rosbridge that is not ours: npm's roslib, in a process of its own

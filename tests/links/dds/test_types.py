@@ -24,7 +24,7 @@ from tfbus.links.dds.types import (
     TransformStamped,
     Vector3,
 )
-from tfbus.tf_message import decode, encode
+from tfbus.tf_message import encode
 
 
 def test_the_bytes_of_a_message_are_those_that_the_library_writes_and_reads() -> None:
@@ -42,21 +42,11 @@ def test_the_bytes_of_a_message_are_those_that_the_library_writes_and_reads() ->
     assert declared.deserialize(encode(samples)).transforms == rows
 
 
-def test_a_message_keeps_its_bytes() -> None:
-    payload = encode([moving("map", "base", 5)])
-    message = RawTFMessage.deserialize(payload)
-    assert message.serialize() == payload
-    assert decode(message.payload).samples == [moving("map", "base", 5)]
-    assert RawTFMessage.deserialize_key(b"").serialize() == b""
-
-
 def test_positions_of_joints_come_as_the_bytes_that_rosbags_reads() -> None:
     payload = joint_state(5, {"a": 0.5, "b": 1.5})
     declared: Any = RawJointState.__idl__
     read = declared.deserialize(payload)
     assert (read.name, read.position) == (["a", "b"], [0.5, 1.5])
-    assert RawJointState.deserialize(payload).payload == payload
-    assert RawJointState.deserialize_key(b"").payload == b""
 
 
 def test_the_nodes_of_a_participant_are_read_as_the_library_writes_them() -> None:

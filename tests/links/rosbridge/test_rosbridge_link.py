@@ -13,7 +13,7 @@ import anyio.lowlevel
 import cbor2
 from support.damage import damaged
 from support.processes import until
-from support.rosbridge import install_roslib, rosbridge_server, roslib_client
+from support.rosbridge import install_roslib, joined, rosbridge_server, roslib_client
 from support.samples import moving, static
 from wsproto.events import TextMessage
 
@@ -91,19 +91,16 @@ async def test_a_client_that_wants_json_hears_the_same_topics_as_a_link(first: b
 
 
 async def test_garbage_is_counted_by_reason_and_ends_nothing() -> None:
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url) as link:
-                await until(lambda: len(server.operations("subscribe")) == 2)
-                other = {"op": "publish", "topic": "/other", "msg": {}}
-                bad = {"op": "publish", "topic": "/tf", "msg": {"transforms": [{}]}}
-                raw = {"op": "publish", "topic": "/tf", "msg": {"bytes": b"\x05\0\0\0"}}
-                no_messages = ("", "[1]", "nonsense", "5", b"\xff", b"\x05", "[" * 100_000, b"\x81" * 100_000)
-                await server.say_anything(*no_messages, json.dumps(other), json.dumps(bad), cbor2.dumps(raw))
-                await server.say_anything(json.dumps({"op": "status", "msg": "hm"}))
-                await server.say(moving("map", "base", 5))
-                await until(lambda: link.statistics().received_samples == 1)
-                assert link.statistics().rejected == {"encoding": 9, "topic": 1, "truncated": 1}
+    async with joined() as (server, _, link):
+        other = {"op": "publish", "topic": "/other", "msg": {}}
+        bad = {"op": "publish", "topic": "/tf", "msg": {"transforms": [{}]}}
+        raw = {"op": "publish", "topic": "/tf", "msg": {"bytes": b"\x05\0\0\0"}}
+        no_messages = ("", "[1]", "nonsense", "5", b"\xff", b"\x05", "[" * 100_000, b"\x81" * 100_000)
+        await server.say_anything(*no_messages, json.dumps(other), json.dumps(bad), cbor2.dumps(raw))
+        await server.say_anything(json.dumps({"op": "status", "msg": "hm"}))
+        await server.say(moving("map", "base", 5))
+        await until(lambda: link.statistics().received_samples == 1)
+        assert link.statistics().rejected == {"encoding": 9, "topic": 1, "truncated": 1}
 
 
 TINY = {
@@ -116,23 +113,20 @@ TINY = {
 
 @pytest.mark.parametrize("frames", TINY)
 async def test_tens_of_thousands_of_tiny_frames_share_the_event_loop_with_others(frames: str) -> None:
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url) as link:
-                await until(lambda: len(server.operations("subscribe")) == 2)
-                count = 1 if frames == "fragments" else 20_000
-                await server.clients[0].stream.send(TINY[frames] * count + b"\x80\1x" * (frames == "fragments"))
-                turns, most, before = 0, 0, 0
-                while before < count:
-                    await anyio.lowlevel.checkpoint()
-                    statistics = link.statistics()
-                    seen = statistics.rejected.get("encoding", 0) + statistics.queue.pending
-                    turns, most, before = turns + 1, max(most, seen - before), seen
-                # In one turn, it would be all of a read.
-                assert most < 5_000
-                assert turns > 5
-                await server.say(moving("map", "base", 5))
-                await until(lambda: link.statistics().received_samples == 1)
+    async with joined() as (server, _, link):
+        count = 1 if frames == "fragments" else 20_000
+        await server.clients[0].stream.send(TINY[frames] * count + b"\x80\1x" * (frames == "fragments"))
+        turns, most, before = 0, 0, 0
+        while before < count:
+            await anyio.lowlevel.checkpoint()
+            statistics = link.statistics()
+            seen = statistics.rejected.get("encoding", 0) + statistics.queue.pending
+            turns, most, before = turns + 1, max(most, seen - before), seen
+        # In one turn, it would be all of a read.
+        assert most < 5_000
+        assert turns > 5
+        await server.say(moving("map", "base", 5))
+        await until(lambda: link.statistics().received_samples == 1)
 
 
 PIECES = [b"\xff", b"\x9b", b"\xbb", b"\xdb", b"\xc2", b"\x5f", b"\xfb\x7f\xf0"]
@@ -148,35 +142,28 @@ async def test_no_damaged_message_ends_a_link_and_each_is_counted_or_heard(cases
     raw = {"op": "publish", "topic": "/tf", "msg": {"secs": 1, "nsecs": 2, "bytes": encode(samples)}}
     good = [text.encode(), cbor2.dumps(json.loads(text)), cbor2.dumps(raw)]
     heard: set[str] = set()
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            bus.subscribe(lambda batch: heard.update(sample.child for sample in batch))
-            async with RosbridgeLink(bus, server.url, max_frames=10**6) as link:
-                await until(lambda: len(server.operations("subscribe")) == 2)
-                for number in range(cases):
-                    content = damaged(random, good[number % 3], PIECES)
-                    as_text = number % 3 == 0
-                    await server.say_anything(content.decode(errors="replace") if as_text else content)
-                await server.say(moving("map", "last", 5))
-                await until(lambda: "last" in heard)
-                assert len(server.operations("subscribe")) == 2, "it is the first connection"
-                counted = link.statistics()
-                assert sum(counted.rejected.values()) > 0
-                assert counted.received_messages > 0
+    async with joined(max_frames=10**6) as (server, bus, link):
+        bus.subscribe(lambda batch: heard.update(sample.child for sample in batch))
+        for number in range(cases):
+            content = damaged(random, good[number % 3], PIECES)
+            await server.say_anything(content.decode(errors="replace") if number % 3 == 0 else content)
+        await server.say(moving("map", "last", 5))
+        await until(lambda: "last" in heard)
+        assert len(server.operations("subscribe")) == 2, "it is the first connection"
+        counted = link.statistics()
+        assert sum(counted.rejected.values()) > 0
+        assert counted.received_messages > 0
 
 
 async def test_one_message_of_thousands_of_transforms_is_published_in_parts_in_its_order() -> None:
     samples = [moving("map", f"frame{number}", 5) for number in range(2_000)]
     for known in ((), ("cbor",), ("cbor", "cbor-raw")):
-        async with rosbridge_server(known) as server:
-            heard: list[Any] = []
-            with Bus() as bus:
-                bus.subscribe(heard.append)
-                async with RosbridgeLink(bus, server.url, encoding="cbor-raw") as link:
-                    await until(lambda: len(server.operations("subscribe")) == 2)
-                    await server.say(*samples)
-                    await until(lambda: link.statistics().received_samples == 2_000)
-                    assert link.statistics().received_messages == 1
+        heard: list[Any] = []
+        async with joined(known, "cbor-raw") as (server, bus, link):
+            bus.subscribe(heard.append)
+            await server.say(*samples)
+            await until(lambda: link.statistics().received_samples == 2_000)
+            assert link.statistics().received_messages == 1
             assert [sample.child for batch in heard for sample in batch] == [sample.child for sample in samples]
             assert max(map(len, heard)) <= 40
 
@@ -205,15 +192,12 @@ async def test_joints_and_the_description_of_a_robot_go_to_who_takes_them(
     topic: str, option: str, message: dict[str, Any], taken: list[Any]
 ) -> None:
     heard: list[Any] = []
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            options: Any = {option: lambda *content: heard.append(content)}
-            async with RosbridgeLink(bus, server.url, **options) as link:
-                await until(lambda: topic in server.operations("subscribe"))
-                for content in ({"data": 5}, message):
-                    await server.say_anything(json.dumps({"op": "publish", "topic": topic, "msg": content}))
-                await until(lambda: heard == taken)
-                assert link.statistics().rejected == {"encoding": 1}
+    options: Any = {option: lambda *content: heard.append(content)}
+    async with joined(**options) as (server, _, link):
+        for content in ({"data": 5}, message):
+            await server.say_anything(json.dumps({"op": "publish", "topic": topic, "msg": content}))
+        await until(lambda: heard == taken)
+        assert link.statistics().rejected == {"encoding": 1}
 
 
 @pytest.mark.parametrize(("encoding", "joints"), [("cbor", "none"), ("cbor-raw", "cbor-raw")])
@@ -240,23 +224,20 @@ async def test_what_is_latched_is_asked_for_first_and_joints_never_in_decoded_cb
 
 async def test_beyond_its_capacity_a_link_drops_what_comes_again_and_nothing_that_is_latched() -> None:
     taken: list[str] = []
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url, capacity=3, robot_description=taken.append) as link:
-                await until(lambda: len(server.operations("subscribe")) == 3)
-                (client,) = server.clients
-                described = {"op": "publish", "topic": "/robot_description", "msg": {"data": "<robot/>"}}
-                news = [server.encoded("/tf", (moving("map", "base", stamp),), "none") for stamp in range(50)]
-                kept = [
-                    TextMessage(json.dumps(described)),
-                    server.encoded("/tf_static", (static("map", "lidar"),), "none"),
-                ]
-                messages = [*news[:25], *kept, *news[25:]]
-                # All in one read.
-                await client.stream.send(b"".join(map(client.connection.send, messages)))
-                await until(lambda: link.statistics().queue.dropped > 0)
-                await until(lambda: bus.statistics().frames == 2)
-                assert taken == ["<robot/>"]
+    async with joined(capacity=3, robot_description=taken.append) as (server, bus, link):
+        (client,) = server.clients
+        described = {"op": "publish", "topic": "/robot_description", "msg": {"data": "<robot/>"}}
+        news = [server.encoded("/tf", (moving("map", "base", stamp),), "none") for stamp in range(50)]
+        kept = [
+            TextMessage(json.dumps(described)),
+            server.encoded("/tf_static", (static("map", "lidar"),), "none"),
+        ]
+        messages = [*news[:25], *kept, *news[25:]]
+        # All in one read.
+        await client.stream.send(b"".join(map(client.connection.send, messages)))
+        await until(lambda: link.statistics().queue.dropped > 0)
+        await until(lambda: bus.statistics().frames == 2)
+        assert taken == ["<robot/>"]
 
 
 @pytest.mark.parametrize("when", ["at once", "settled", "cancelled"])

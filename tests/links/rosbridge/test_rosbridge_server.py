@@ -6,9 +6,8 @@ The tests run in simulated time: it goes on when nobody has anything to do, so s
 import itertools
 import json
 import ssl
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
-from typing import Any, Literal, NamedTuple, Unpack
+from contextlib import AbstractAsyncContextManager, suppress
+from typing import Any, Unpack
 
 import anyio
 import anyio.abc
@@ -18,7 +17,8 @@ import pytest
 pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
 pytest.importorskip("trio")
 
-from support.rosbridge import RosbridgeServer, rosbridge_server
+from support import rosbridge
+from support.rosbridge import Joined, rosbridge_server
 from support.samples import moving, static
 from support.wires import latched
 from trio.testing import MockClock
@@ -31,9 +31,7 @@ from tfbus.links.rosbridge import RosbridgeLink
 
 pytestmark = pytest.mark.anyio
 
-Encodings = tuple[Literal["cbor", "cbor-raw"], ...]
-ROS_1: Encodings = ("cbor",)
-ROS_2: Encodings = ("cbor-raw", "cbor")
+ROS_1, ROS_2 = ("cbor",), ("cbor-raw", "cbor")
 """The encodings of a server whose messages are those of ROS 1, and of one of ROS 2; the first is asked for."""
 
 
@@ -47,33 +45,8 @@ async def settle() -> None:
     await anyio.sleep(0.02)
 
 
-class Joined(NamedTuple):
-    """A link that has joined a server."""
-
-    server: RosbridgeServer
-    bus: Bus
-    link: RosbridgeLink
-
-    def not_sent(self) -> dict[str, int]:
-        return dict(self.link.statistics().not_sent)
-
-    def published(self, topic: str) -> list[dict[str, Any]]:
-        """The transforms that the server has got on a topic."""
-        said = [each for each in self.server.requests if each["op"] == "publish" and each["topic"] == topic]
-        return [row for each in said for row in each["msg"]["transforms"]]
-
-    def times(self, operation: str, topic: str) -> list[float]:
-        """When the server got some requests."""
-        return [each["at"] for each in self.server.requests if (each["op"], each["topic"]) == (operation, topic)]
-
-
-@asynccontextmanager
-async def joined(encodings: Encodings = ROS_2, **options: Unpack[RosOptions]) -> AsyncIterator[Joined]:
-    async with rosbridge_server(encodings) as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url, encoding=encodings[0], **options) as link:
-                await settle()
-                yield Joined(server, bus, link)
+def joined(encodings: tuple[str, ...] = ROS_2, **options: Unpack[RosOptions]) -> AbstractAsyncContextManager[Joined]:
+    return rosbridge.joined(encodings, "cbor-raw" if encodings == ROS_2 else "cbor", **options)
 
 
 def gaps(times: list[float]) -> list[float]:
@@ -409,7 +382,7 @@ async def test_after_a_break_what_the_former_publisher_left_at_a_server_of_ros_2
     ("encodings", "published", "held"), [(ROS_2, True, True), (ROS_1, True, False), (ROS_2, False, False)]
 )
 async def test_after_a_break_ros_2_forgets_the_former_publisher_before_moving_frames_go_out_again(
-    encodings: Encodings, published: bool, held: bool
+    encodings: tuple[str, ...], published: bool, held: bool
 ) -> None:
     async with joined(encodings) as end:
         # Nothing moves yet, so the topic of moving frames is not advertised.
