@@ -61,7 +61,7 @@ class RosbridgeServer:
     Parameters
     ----------
     encodings : collection of str
-        Those that it knows; it answers in JSON to others.
+        The server knows these, and answers in JSON to others.
 
     Attributes
     ----------

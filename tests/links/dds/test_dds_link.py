@@ -63,7 +63,7 @@ async def joined(number: int, **options: Unpack[RosOptions]) -> AsyncIterator[Jo
             yield Joined(bus, link, heard)
 
 
-# What comes in
+# Messages that come in
 
 
 async def test_messages_come_with_the_name_of_their_node(domain_number: int) -> None:
@@ -276,7 +276,7 @@ async def test_an_error_of_the_library_keeps_no_message_of_others_from_coming(
         assert all("DDS cannot be read" in text and len(text) < 300 for text in told)
 
 
-# What goes out
+# Messages that go out
 
 
 async def test_two_buses_in_one_domain_hear_each_other_and_a_late_one_the_last_static_frames(

@@ -106,7 +106,7 @@ async def joined(address: str, **options: Unpack[RosOptions]) -> AsyncIterator[J
             yield Joined(bus, link, heard, session)
 
 
-# What rmw_zenoh says and hears
+# The keys, tokens and attachments of rmw_zenoh
 
 
 def test_the_hash_is_that_of_the_type() -> None:
@@ -311,7 +311,7 @@ async def test_a_node_of_another_program_is_heard_again_when_it_is_back_and_a_li
                 for _ in range(2):
                     async with RmwZenohLink(bus, address, DOMAIN), anyio.create_task_group() as tasks:
                         tasks.start_soon(program.send)
-                        # What has not been sent yet.
+                        # A stamp that nobody has sent yet.
                         await buffer.lookup("odom", "tool", time.time_ns() + SECOND // 10, timeout=20.0)
                         await anyio.sleep(1.0)
                         tasks.cancel_scope.cancel()

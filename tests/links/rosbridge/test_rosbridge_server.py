@@ -1,4 +1,4 @@
-"""What a link does when its server breaks, falls silent, is too slow, refuses frames, or says things of itself.
+"""A link whose server breaks, falls silent, is too slow, refuses frames, or says things of itself.
 
 The tests run in simulated time: it goes on when nobody has anything to do, so seconds cost nothing and are exact.
 """
@@ -375,7 +375,7 @@ async def test_after_a_break_what_the_former_publisher_left_at_a_server_of_ros_2
         assert end.link.statistics().duplicates > before
 
 
-# What a server of ROS 2 needs
+# Servers of ROS 2
 
 
 @pytest.mark.parametrize(
@@ -413,7 +413,7 @@ async def test_after_a_break_moving_frames_go_out_when_those_of_ros_2_come_in() 
         end.bus.publish(moving("map", "base", 1))
         await settle()
         await end.server.cut()
-        # What a server of ROS 2 gives during the first two seconds may be of this link itself.
+        # During the first two seconds, a server of ROS 2 may give frames of this link itself.
         for stamp in (2, 3):
             await anyio.sleep(1.2)
             await end.server.say(moving("map", "arm", stamp))
@@ -429,7 +429,7 @@ async def test_after_a_break_moving_frames_go_out_when_those_of_ros_2_come_in() 
 async def test_static_frames_are_asked_for_ever_more_seldom_while_a_lookup_waits() -> None:
     async with joined(ROS_1) as end:
         with Buffer(end.bus) as buffer:
-            # What is heard already is not asked for again.
+            # The link does not ask again for moving frames when it has heard some.
             await end.server.say(moving("map", "base", 1))
             with anyio.move_on_after(50.0):
                 await buffer.lookup("map", "lidar", timeout=1e6)

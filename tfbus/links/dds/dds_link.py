@@ -161,7 +161,7 @@ _ANY = Qos(Policy.Reliability.BestEffort, Policy.IgnoreLocal.Participant, Policy
 
 
 class ReadingError(MalformedMessageError):
-    """What has kept messages from being read; it is counted like a malformed message, though none was malformed."""
+    """An error that has kept messages from being read; it is counted like a malformed message, though none was."""
 
     def __str__(self) -> str:
         return self.detail

@@ -4,7 +4,7 @@
 waits, one pings, and three work around what servers do. When the first of them fails, all end, the peer is lost, and
 the carrier connects again. All runs in the event loop, and all times are those of its clock.
 
-What waits to be written is in three places. Requests go first, in their order. Of the static frames only the newest
+Texts wait in three places to be written. Requests go first, in their order. Of the static frames only the newest
 message waits, because each holds all of them. Moving frames are a queue whose oldest give way.
 
 A server tells nobody what it refuses: rosbridge_suite writes it to its own log, and then a static frame never arrives.
