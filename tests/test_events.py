@@ -1,4 +1,4 @@
-""""""
+"""The texts and the plain data of events and statistics."""
 
 import json
 import pickle

@@ -3,7 +3,6 @@
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -185,22 +184,6 @@ def test_a_module_imports_nothing_beyond_the_dependencies_but_the_extras_of_its_
 
 def test_no_import_hides_behind_type_checking() -> None:
     assert [module for module in MODULES if "TYPE_CHECKING" in SOURCES[module].read_text(encoding="utf-8")] == []
-
-
-def options_of_dataclasses(module: str) -> Iterator[tuple[str, dict[str, object]]]:
-    """The name of each dataclass of a module, with the options that it is made with."""
-    classes = [node for node in ast.walk(parsed(module)) if isinstance(node, ast.ClassDef)]
-    for node in classes:
-        for decorator in node.decorator_list:
-            if isinstance(decorator, ast.Call) and getattr(decorator.func, "id", "") == "dataclass":
-                options = {str(option.arg): getattr(option.value, "value", None) for option in decorator.keywords}
-                yield f"{module}.{node.name}", options
-
-
-def test_every_dataclass_has_slots() -> None:
-    found = dict(pair for module in MODULES for pair in options_of_dataclasses(module))
-    assert len(found) > 80
-    assert [name for name, options in found.items() if options.get("slots") is not True] == []
 
 
 def test_no_room_imports_what_another_marks_as_its_own() -> None:

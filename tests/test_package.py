@@ -1,4 +1,4 @@
-""""""
+"""The names of the package, and the package as a program."""
 
 import ast
 import runpy

@@ -1,3 +1,5 @@
+"""Stamps, durations, dates and their texts."""
+
 import copy
 import math
 import pickle
@@ -75,12 +77,6 @@ def test_nanoseconds_are_added_to_the_rounded_seconds(seconds: float) -> None:
     assert from_seconds(seconds, 7) == round(seconds * SECOND) + 7
 
 
-@pytest.mark.parametrize("arguments", [("1",), (None,), (True,), (1j,), (1, 0.5), (1, "1")])
-def test_seconds_that_are_no_number_are_a_type_error(arguments: tuple[Any, ...]) -> None:
-    with pytest.raises(TypeError, match="seconds must be a"):
-        from_seconds(*arguments)
-
-
 @pytest.mark.parametrize(
     ("seconds", "nanoseconds", "beyond"), [(9_223_372_036, 854_775_807, 1), (-9_223_372_036, -854_775_808, -1)]
 )
@@ -107,22 +103,73 @@ def test_an_instant_that_is_asked_for_may_be_latest_or_none() -> None:
         as_at(1.5)  # type: ignore[call-overload]
 
 
-@pytest.mark.parametrize("value", [1.5, math.nan, np.float64(1.5)])
-def test_a_float_stamp_is_a_type_error_that_names_from_seconds(value: object) -> None:
-    with pytest.raises(TypeError, match="from_seconds"):
+NO_INTEGER = "int of nanoseconds"
+NO_STAMPS = [
+    *[pytest.param(value, TypeError, "from_seconds") for value in (1.5, math.nan, np.float64(1.5))],
+    *[pytest.param(value, TypeError, NO_INTEGER) for value in (None, "1", True, np.True_, Fraction(1), LATEST, [1])],
+    *[pytest.param(value, TypeError, NO_INTEGER) for value in (Decimal(1), np.float32(1))],
+    *[pytest.param(value, ValueError, "64-bit") for value in (-(2**63) - 1, 2**63, 10**30, np.uint64(2**63))],
+]
+
+
+@pytest.mark.parametrize(("value", "error", "problem"), NO_STAMPS)
+def test_a_value_that_is_no_integer_of_64_bits_is_an_error_alone_and_among_others(
+    value: Any, error: type[Exception], problem: str
+) -> None:
+    with pytest.raises(error, match=problem):
         as_stamp(value)
+    for values in ([value, 5], [5, value], (5, value, 6)):
+        with pytest.raises(error, match=r"int of nanoseconds|64-bit"):
+            as_stamps(values)
 
 
-@pytest.mark.parametrize("value", [None, "1", True, np.True_, Fraction(1), Decimal(1), LATEST, np.float32(1), [1]])
-def test_a_value_that_is_no_integer_is_a_type_error(value: object) -> None:
-    with pytest.raises(TypeError, match="int of nanoseconds"):
-        as_stamp(value)
+@pytest.mark.parametrize(
+    ("values", "error", "problem"),
+    [
+        *[(np.array([1, 0]).astype(kind), TypeError, NO_INTEGER) for kind in ("f8", "f4", "?", "c16", "m8[s]", "U3")],
+        (np.array([0, 2**63], np.uint64), ValueError, "64-bit"),
+        *[
+            (values, ValueError, r"shape \(n,\), got \(")
+            for values in (5, [[5], [6]], np.zeros((2, 0), int), np.array(5))
+        ],
+    ],
+)
+def test_an_array_of_another_type_or_shape_is_an_error(values: Any, error: type[Exception], problem: str) -> None:
+    with pytest.raises(error, match=problem):
+        as_stamps(values)
 
 
-@pytest.mark.parametrize("value", [-(2**63) - 1, 2**63, 10**30, np.uint64(2**63)])
-def test_a_stamp_beyond_64_bits_is_a_value_error(value: object) -> None:
-    with pytest.raises(ValueError, match="64-bit"):
-        as_stamp(value)
+@pytest.mark.parametrize("value", [0, 0.0, 1, 2.5, math.inf])
+def test_a_duration_is_a_float_that_may_be_infinite(value: float) -> None:
+    assert (type(as_duration(value, "timeout")), as_duration(value, "timeout")) == (float, value)
+
+
+@pytest.mark.parametrize("value", [-1e-9, -1, -math.inf, math.nan])
+def test_a_negative_duration_is_a_value_error_that_names_the_argument(value: float) -> None:
+    with pytest.raises(ValueError, match=rf"keep .*{value!r}"):
+        as_duration(value, "keep")
+
+
+@pytest.mark.parametrize("value", [None, "1", True, LATEST, [1.0], 1j])
+def test_seconds_that_are_no_number_are_a_type_error(value: Any) -> None:
+    with pytest.raises(TypeError, match="keep must be a number of seconds"):
+        as_duration(value, "keep")
+    for arguments in ((value,), (1, "1"), (1, 0.5)):
+        with pytest.raises(TypeError, match="seconds must be a"):
+            from_seconds(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (format_stamp, {12_500_000_000: "12.500 s", 0: "0.000 s", -1: "-0.000000001 s", 1_000_100_000: "1.0001 s"}),
+        (format_duration, {0: "0 ns", 999: "999 ns", 1_500: "1.5 us", 999_999: "1000 us", -410_000_000: "-410 ms"}),
+        (format_duration, {3_600 * SECOND: "3600 s", 2 * DAY - 1: "172800 s", 2 * DAY: "2 days"}),
+        (lambda age: format_age(100, 100 + age), {-2_500_000_000: "2.5 s ahead", -1: "1 ns ahead", 0: "age 0 ns"}),
+    ],
+)
+def test_texts_of_stamps_durations_and_ages(text: Callable[[int], str], expected: dict[int, str]) -> None:
+    assert {number: text(number) for number in expected} == expected
 
 
 # 2020-02-29 12:00:00 UTC is 18,321.5 days after the epoch.
@@ -142,9 +189,6 @@ DATES = [
     pytest.param(np.datetime64(-1, "ps"), -1, id="ps"),
     pytest.param(np.datetime64(1_999_999, "fs"), 1, id="fs"),
     pytest.param(np.datetime64(2 * SECOND, "as"), 2, id="as"),
-    pytest.param(np.datetime64(1_999, "ps"), 1, id="almost 2000 ps"),
-    pytest.param(np.datetime64(2_000, "ps"), 2, id="2000 ps"),
-    pytest.param(np.datetime64(2_000_000, "fs"), 2, id="2000000 fs"),
     pytest.param(np.datetime64("2262-04"), 9_222_422_400 * SECOND, id="last month"),
     pytest.param(np.datetime64("1677-10"), -106_742 * DAY, id="first month"),
     # 1972 to 2260 are 73 leap years but for 2100 and 2200; 1680 to 1968 but for 1700, 1800 and 1900.
@@ -186,11 +230,8 @@ def test_the_last_date_of_each_unit_is_a_stamp_and_the_next_is_beyond_64_bits(un
         (np.datetime64("NaT", "ns"), "not NaT"),
         (np.datetime64("2262-05"), "64-bit"),
         (np.datetime64("1677-09-21T00:12:43"), "64-bit"),
-        (np.datetime64("2263"), "64-bit"),
         (np.datetime64("9999-01"), r"'9999-01'.* 64-bit"),
-        (np.datetime64("9999"), r"'9999'.* 64-bit"),
         (np.datetime64(2**62, "Y"), "64-bit"),
-        (np.datetime64(-(2**62), "us"), "64-bit"),
         (np.datetime64(1, (b"W", 2**31 - 1)), "64-bit"),
     ],
 )
@@ -214,41 +255,6 @@ def test_a_timestamp_of_pandas_keeps_its_nanoseconds() -> None:
         as_stamp(pandas.NaT)
 
 
-@pytest.mark.parametrize("value", [0, 0.0, 1, 2.5, math.inf])
-def test_a_duration_is_a_float_that_may_be_infinite(value: float) -> None:
-    seconds = as_duration(value, "timeout")
-    assert type(seconds) is float
-    assert seconds == value
-
-
-@pytest.mark.parametrize("value", [-1e-9, -1, -math.inf, math.nan])
-def test_a_negative_duration_is_a_value_error_that_names_the_argument(value: float) -> None:
-    with pytest.raises(ValueError, match=rf"timeout .*{value!r}"):
-        as_duration(value, "timeout")
-
-
-@pytest.mark.parametrize("value", [None, "1", True, LATEST, [1.0]])
-def test_a_duration_that_is_no_number_is_a_type_error_that_names_the_argument(value: Any) -> None:
-    with pytest.raises(TypeError, match="keep must be a number of seconds"):
-        as_duration(value, "keep")
-
-
-@pytest.mark.parametrize(
-    ("stamp", "text"),
-    [
-        (12_500_000_000, "12.500 s"),
-        (12_500_000_001, "12.500000001 s"),
-        (0, "0.000 s"),
-        (1, "0.000000001 s"),
-        (-1, "-0.000000001 s"),
-        (-1_500_000_000, "-1.500 s"),
-        (1_000_100_000, "1.0001 s"),
-    ],
-)
-def test_the_text_of_a_stamp_has_at_least_milliseconds(stamp: int, text: str) -> None:
-    assert format_stamp(stamp) == text
-
-
 @given(stamps())
 def test_the_text_of_a_stamp_is_exact(stamp: int) -> None:
     number, unit = format_stamp(stamp).split(" ")
@@ -256,42 +262,11 @@ def test_the_text_of_a_stamp_is_exact(stamp: int) -> None:
     assert Fraction(number) * SECOND == stamp
 
 
-@pytest.mark.parametrize(
-    ("nanoseconds", "text"),
-    [
-        (0, "0 ns"),
-        (1, "1 ns"),
-        (999, "999 ns"),
-        (1_000, "1 us"),
-        (1_500, "1.5 us"),
-        (999_999, "1000 us"),
-        (1_000_000, "1 ms"),
-        (410_000_000, "410 ms"),
-        (SECOND, "1 s"),
-        (2_500_000_000, "2.5 s"),
-        (3_600 * SECOND, "3600 s"),
-        (2 * 86_400 * SECOND - 1, "172800 s"),
-        (2 * 86_400 * SECOND, "2 days"),
-        (1_795_560_204 * SECOND, "56.9 years"),
-        (-410_000_000, "-410 ms"),
-    ],
-)
-def test_the_text_of_a_duration_has_the_fitting_unit(nanoseconds: int, text: str) -> None:
-    assert format_duration(nanoseconds) == text
-
-
 @given(st.integers(-(2**64), 2**64))
 def test_the_text_of_a_duration_has_three_correct_digits(nanoseconds: int) -> None:
     number, unit = format_duration(nanoseconds).split(" ")
     size = {**UNITS, "days": DAY, "years": 365 * DAY}[unit]
     assert abs(Fraction(number) * size - nanoseconds) <= abs(Fraction(nanoseconds)) * Fraction(5, 1000)
-
-
-@pytest.mark.parametrize(
-    ("age", "text"), [(-2_500_000_000, "2.5 s ahead"), (-1, "1 ns ahead"), (0, "age 0 ns"), (1, "age 1 ns")]
-)
-def test_the_text_of_an_age_says_when_it_is_ahead(age: int, text: str) -> None:
-    assert format_age(100, 100 + age) == text
 
 
 WALL = 1_795_560_204 * SECOND
@@ -392,34 +367,6 @@ def test_stamps_with_a_mask_are_refused_if_one_is_masked() -> None:
         as_stamps(cast(Any, [1, np.ma.masked]))
     assert as_stamps(values[:1]).tolist() == [1]
     assert as_stamps(values.compressed()).tolist() == [1]
-
-
-@pytest.mark.parametrize("bad", [1.5, 1.0, None, "1", True, np.True_, LATEST, np.float64(1.0), [1]])
-def test_one_value_that_is_no_integer_makes_a_list_a_type_error(bad: object) -> None:
-    for place in range(3):
-        values: list[Any] = [5, 6]
-        values.insert(place, bad)
-        for sequence in (values, tuple(values)):
-            with pytest.raises(TypeError, match="int of nanoseconds"):
-                as_stamps(sequence)
-
-
-@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.bool_, np.complex128, "m8[s]", "U3"])
-def test_an_array_of_another_type_is_a_type_error(dtype: Any) -> None:
-    with pytest.raises(TypeError, match="int of nanoseconds"):
-        as_stamps(np.array([1, 0], np.int64).astype(dtype))
-
-
-@pytest.mark.parametrize("values", [[2**63], [-1, 2**63], [2**64, 0], np.array([0, 2**63], np.uint64)])
-def test_one_stamp_beyond_64_bits_among_many_is_a_value_error(values: Any) -> None:
-    with pytest.raises(ValueError, match="64-bit"):
-        as_stamps(values)
-
-
-@pytest.mark.parametrize("values", [5, [[5], [6]], np.zeros((2, 0), np.int64), np.array(5)])
-def test_many_stamps_of_another_shape_are_a_value_error(values: Any) -> None:
-    with pytest.raises(ValueError, match=r"shape \(n,\), got \("):
-        as_stamps(values)
 
 
 @given(st.lists(st.tuples(stamps(), stamps()), min_size=1))

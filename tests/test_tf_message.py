@@ -1,3 +1,5 @@
+"""Messages of tf, to and from bytes."""
+
 import copy
 import itertools
 import math
@@ -9,7 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from support import strategies as some
@@ -166,28 +168,19 @@ def test_a_message_in_parts_is_the_whole_one(most: int) -> None:
         assert len(parts) == sound
 
 
-def test_the_options_of_the_header_do_not_matter() -> None:
-    payload = encode([moving("map", "base", 7)])
-    assert decode(payload[:2] + b"\xff\x03" + payload[4:]).samples == [moving("map", "base", 7)]
-
-
-@pytest.mark.parametrize("zeros", range(4))
-def test_up_to_three_zeros_behind_a_message_are_padding(zeros: int) -> None:
-    for samples in ([], [moving("map", "base", 7)]):
-        assert decode(encode(samples) + bytes(zeros)).samples == samples
-
-
-def test_a_payload_may_be_a_slice_of_a_larger_buffer() -> None:
+def test_options_of_the_header_paddings_and_a_buffer_around_it_do_not_change_a_message() -> None:
     samples = [moving("map", "base", 7)]
-    buffer = memoryview(b"xyz" + encode(samples) + b"xyz")
-    assert decode(buffer[3:-3]).samples == samples
-
-
-def test_padding_may_be_anything() -> None:
-    payload = bytearray(message_of(Part()))
-    at = payload.index(b"base\0") + 5
-    payload[at : at + 3] = b"\xff\xfe\xfd"
-    assert decode(bytes(payload)).samples == [moving("map", "base", 12 * SECOND + 5)]
+    payload = encode(samples)
+    within = payload.index(b"base\0") + 5
+    same_messages: tuple[bytes | memoryview, ...] = (
+        payload[:2] + b"\xff\x03" + payload[4:],
+        payload[:within] + b"\xff\xfe\xfd" + payload[within + 3 :],
+        memoryview(b"xyz" + payload + b"xyz")[3:-3],
+        *(payload + bytes(zeros) for zeros in range(4)),
+    )
+    for same in same_messages:
+        assert decode(same).samples == samples
+    assert [decode(encode([]) + bytes(zeros)).samples for zeros in range(4)] == [[]] * 4
 
 
 class Marked(TransformStamped):
@@ -202,16 +195,6 @@ def test_samples_have_the_given_type() -> None:
         assert type(marked) is Marked
         assert bits(marked) == bits(samples[0])
         marked.mark = "mine"
-
-
-def test_leading_slashes_are_removed_only_with_bare_names() -> None:
-    payload = message_of(Part(b"/map", b"//base"), Part(b"odom", b"arm"))
-    for _ in range(2):
-        bare = decode(payload, bare_names=True)
-        assert [(s.parent, s.child) for s in bare.samples if s] == [("map", "base"), ("odom", "arm")]
-        kept = decode(payload)
-        assert [sample is None for sample in kept.samples] == [True, False]
-        assert [error.reason for error in kept.errors] == ["frame name"]
 
 
 # Decoding what is bad, one transform at a time.
@@ -296,18 +279,12 @@ def test_each_transform_is_accepted_normalised_or_refused_as_by_the_classes(
     ("bad", "reason", "parent", "child"),
     [
         (Part(nanosec=SECOND), "stamp", "map", "base"),
-        (Part(nanosec=2**32 - 1), "stamp", "map", "base"),
         (Part(child=b"\xff"), "frame name", "map", None),
         (Part(parent=b"caf\xe9"), "frame name", None, "base"),
         (Part(child=b"\xed\xa0\x80"), "frame name", "map", None),
         (Part(child=b"a" * (MAX_NAME + 1)), "frame name", "map", None),
-        (Part(parent=b"/map"), "frame name", "/map", "base"),
         (Part(child=b""), "frame name", "map", ""),
-        (Part(child=b"map"), "self transform", "map", "map"),
         (Part(numbers=(0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 1.0)), "not finite", "map", "base"),
-        (Part(numbers=(0.0, 0.0, 0.0, 0.0, 0.0, -math.inf, 1.0)), "not finite", "map", "base"),
-        (Part(numbers=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), "zero quaternion", "map", "base"),
-        (Part(numbers=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.011)), "not a unit quaternion", "map", "base"),
     ],
 )
 def test_a_bad_transform_is_refused_with_its_facts_and_its_neighbours_are_not(
@@ -419,20 +396,14 @@ def check(payload: bytes) -> None:
             assert sample.replace() == sample
 
 
-@given(payload=st.binary(max_size=400))
-@example(payload=b"")
-def test_random_bytes_do_no_harm(payload: bytes) -> None:
-    check(payload)
-
-
-@given(
-    order=st.sampled_from((b"\0\0\0\0", b"\0\1\0\0")),
-    count=st.integers(0, 3),
-    rest=st.binary(max_size=400),
-    pad=st.integers(0, 300),
+HEADERS = st.sampled_from((b"\0\0\0\0", b"\0\1\0\0")).flatmap(
+    lambda order: st.integers(0, 3).map(lambda count: order + count.to_bytes(4, "little" if order[1] else "big"))
 )
-def test_random_bytes_behind_a_good_header_do_no_harm(order: bytes, count: int, rest: bytes, pad: int) -> None:
-    check(order + count.to_bytes(4, "little" if order[1] else "big") + rest + bytes(pad))
+
+
+@given(begin=st.just(b"") | HEADERS, rest=st.binary(max_size=400), pad=st.integers(0, 300))
+def test_random_bytes_do_no_harm(begin: bytes, rest: bytes, pad: int) -> None:
+    check(begin + rest + bytes(pad))
 
 
 @given(little_endian=st.booleans(), wanted=st.lists(parts(), min_size=1, max_size=4), data=st.data())

@@ -1,4 +1,4 @@
-""""""
+"""Waking a loop from threads, letting all tasks settle, and waiting for the ends of threads and task groups."""
 
 import asyncio
 import threading
@@ -25,21 +25,6 @@ PATIENCE = 30.0
 """Real seconds after which a test that hangs is given up."""
 
 
-class CountedWaker:
-    """A waker with the number of its calls, and an event for the next call."""
-
-    def __init__(self) -> None:
-        self.waker = LoopWaker(self._answer)
-        self.calls = 0
-        self.threads: set[int] = set()
-        self.called = anyio.Event()
-
-    def _answer(self) -> None:
-        self.calls += 1
-        self.threads.add(threading.get_ident())
-        self.called.set()
-
-
 async def test_a_callback_that_raises_is_logged_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
     answers: list[int] = []
     waker = LoopWaker(lambda: answers.append(1 // len(answers)))
@@ -53,40 +38,15 @@ async def test_a_callback_that_raises_is_logged_and_ends_nothing(caplog: pytest.
     assert answers == [0, 1]
 
 
-def test_a_wake_that_a_closed_loop_never_answered_makes_the_next_one_raise_until_the_waker_is_bound_again() -> None:
-    counted = CountedWaker()
-
-    async def connect() -> None:
-        counted.waker.bind()
-
-    for _ in range(2):
-        native = asyncio.new_event_loop()
-        native.run_until_complete(connect())
-        counted.waker.wake()
-        native.close()
-        for _ in range(2):
-            with pytest.raises(RuntimeError):
-                counted.waker.wake()
-        assert counted.calls == 0
-
-    async def answer() -> None:
-        counted.waker.bind()
-        counted.waker.wake()
-        await asyncio.wait_for(counted.called.wait(), PATIENCE)
-
-    asyncio.run(answer())
-    assert counted.calls == 1
-
-
 def test_waking_in_a_thread_while_the_loop_ends_raises(run: Run) -> None:
-    counted = CountedWaker()
+    waker = LoopWaker(list)
     begun = threading.Event()
     errors: list[Exception] = []
 
     def keep_waking() -> None:
         while not errors:
             try:
-                counted.waker.wake()
+                waker.wake()
             except RuntimeError as error:
                 errors.append(error)
             begun.set()
@@ -94,7 +54,7 @@ def test_waking_in_a_thread_while_the_loop_ends_raises(run: Run) -> None:
     thread = threading.Thread(target=keep_waking)
 
     async def serve() -> None:
-        counted.waker.bind()
+        waker.bind()
         thread.start()
         assert begun.wait(PATIENCE)
 
@@ -119,22 +79,6 @@ class Log:
         self.ended += 1
 
 
-async def events(hops: int, log: Log) -> None:
-    """Each of many tasks waits for the one before it."""
-    async with anyio.create_task_group() as tasks:
-        chain = [anyio.Event() for _ in range(hops + 1)]
-
-        async def pass_on(hop: int) -> None:
-            await chain[hop].wait()
-            chain[hop + 1].set()
-
-        for hop in range(hops):
-            tasks.start_soon(pass_on, hop)
-        chain[0].set()
-        await chain[-1].wait()
-    log.end()
-
-
 async def nested_task_groups(hops: int, log: Log) -> None:
     if hops:
         async with anyio.create_task_group() as tasks:
@@ -150,7 +94,7 @@ async def checkpoints(hops: int, log: Log) -> None:
 
 
 @pytest.mark.parametrize("hops", [1, 2, 100])
-@pytest.mark.parametrize("chain", [events, nested_task_groups, checkpoints])
+@pytest.mark.parametrize("chain", [nested_task_groups, checkpoints])
 async def test_a_chain_has_ended_before_settling_ends(
     chain: Callable[[int, Log], Coroutine[Any, Any, None]], hops: int
 ) -> None:

@@ -1,3 +1,5 @@
+"""The requests that a web server of ours answers, and those that it refuses."""
+
 import socket
 from typing import Any
 

@@ -1,4 +1,4 @@
-""""""
+"""Errors of one trajectory against another, by closed forms and by evo."""
 
 import math
 from dataclasses import astuple
@@ -79,7 +79,7 @@ def test_poses_are_compared_with_the_nearest_in_time_within_the_limit() -> None:
     wanted = tree([(k * 100 * MS, Transform((float(k), 0.0, 0.0))) for k in range(4)])
     stamps = [8, 95, 111, 195, 205, 300]
     found = tree([(stamp * MS, Transform((float(at), 0.0, 0.0))) for at, stamp in enumerate(stamps)])
-    # Of two that are equally near, the earlier one; the shorter trajectory leads.
+    # The earlier one of two poses that are equally near is taken; the shorter trajectory leads.
     both = [compare(*pair, "map", "base") for pair in ((wanted, found), (found, wanted))]
     assert both[0].absolute.stamps.tolist() == [k * 100 * MS for k in range(4)]
     assert both[1].absolute.stamps.tolist() == [stamp * MS for stamp in (8, 95, 195, 300)]

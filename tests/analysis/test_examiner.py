@@ -1,4 +1,4 @@
-""""""
+"""Findings about streams of samples and about trees."""
 
 import math
 import random
@@ -39,26 +39,63 @@ def facts(finding: Finding) -> tuple[int, int | None, float | None, int | None]:
     return finding.count, finding.first, None if finding.worst is None else round(finding.worst, 6), finding.at
 
 
-def test_a_translation_that_cannot_be_is_found_and_is_no_jump() -> None:
-    samples = drive()
-    samples[40] = moving("odom", "base", samples[40].stamp, 1e32)
-    samples[50] = moving("odom", "base", samples[50].stamp, 1e9)
-    found = examine([sample.replace(authority="") for sample in samples])
-    assert facts(found.pop(("translation", "base"))) == (2, 4 * SECOND, 1e32, 4 * SECOND)
-    assert found == {}
+def placed(samples: list[TransformStamped], places: dict[int, float]) -> list[TransformStamped]:
+    """The samples, some of which are at another x."""
+    found = list(samples)
+    for at, x in places.items():
+        found[at] = moving("odom", "base", samples[at].stamp, x, "odometry")
+    return found
 
 
-def test_a_jump_is_beyond_the_bound_or_far_beyond_what_the_frame_usually_does() -> None:
-    samples = drive(speed=0.1)
-    # From 0.1 m/s to 3 m/s and back: far below the bound.
-    samples[40] = moving("odom", "base", samples[40].stamp, 0.7, "odometry")
-    found = examine(samples)
-    assert facts(found.pop(("jump", "base"))) == (2, 4 * SECOND, 3.1, 4 * SECOND)
-    assert found == {}
-    # Without a usual speed, only the bound counts.
-    few = [moving("odom", "base", 0), moving("odom", "base", SECOND, 9.0), moving("odom", "base", 2 * SECOND, 9.0)]
-    assert examine(few) == {}
-    assert facts(examine(few, speed=8.0)["jump", "base"]) == (1, SECOND, 9.0, SECOND)
+TEN = drive(10)
+FEW = [moving("odom", "base", k * SECOND, x) for k, x in enumerate((0.0, 9.0, 9.0))]
+BOXES = [moving("a", "box", k * 100 * MS, 0.0) for k in range(30)]
+BOXES += [moving("b", "box", k * 100 * MS, 500.0) for k in range(30, 60)]
+
+
+@pytest.mark.parametrize(
+    ("samples", "options", "expected"),
+    [
+        # A place that cannot be is no jump.
+        (placed(drive(), {40: 1e32, 50: 1e9}), {}, {("translation", "base"): (2, 4 * SECOND, 1e32, 4 * SECOND)}),
+        # From 0.1 m/s to 3 m/s and back: far beyond the usual speed, and far below the bound.
+        (placed(drive(speed=0.1), {40: 0.7}), {}, {("jump", "base"): (2, 4 * SECOND, 3.1, 4 * SECOND)}),
+        # Without a usual speed, only the bound counts.
+        (FEW, {}, {}),
+        (FEW, {"speed": 8.0}, {("jump", "base"): (1, SECOND, 9.0, SECOND)}),
+        # Another parent is no jump.
+        ([*BOXES, static("a", "b", 1.0)], {}, {("two parents", "box"): (1, 3 * SECOND, None, None)}),
+        (
+            [*TEN[:3], TEN[5], TEN[4], TEN[3], *TEN[6:]],
+            {},
+            {("stamps go back", "base"): (2, 4 * 100 * MS, 0.2, 300 * MS)},
+        ),
+        (TEN, {"delay": -80 * MS}, {("ahead", "base"): (10, 0, 0.08, 0)}),
+        (TEN, {"delay": -50 * MS}, {}),
+        (
+            [*TEN, TEN[4], TEN[4], TEN[7]],
+            {},
+            {
+                ("duplicate stamps", "base"): (3, 400 * MS, None, None),
+                ("stamps go back", "base"): (3, 400 * MS, 0.5, 400 * MS),
+            },
+        ),
+        (
+            [static("base", "arm", float(x), stamp=at) for at, x in enumerate([1, 1, 2, 2, 3])],
+            {},
+            {("static changes", "arm"): (2, 2, None, None)},
+        ),
+        (
+            [static("odom", "base", authority="odometry"), *drive(5)],
+            {},
+            {("two kinds", "base"): (5, 0, None, None)},
+        ),
+    ],
+)
+def test_a_fault_is_found_with_its_number_first_stamp_and_worst_value(
+    samples: list[TransformStamped], options: dict[str, Any], expected: dict[tuple[str, str], object]
+) -> None:
+    assert {key: facts(finding) for key, finding in examine(samples, **options).items()} == expected
 
 
 def turned(stamp: int, angle: float) -> TransformStamped:
@@ -72,37 +109,6 @@ def test_a_turn_rate_is_exact_for_small_angles_and_large_ones(angle: float) -> N
     finding = examine(samples, turn_rate=angle * 0.999)["turn", "base"]
     assert (finding.count, finding.first) == (2, SECOND)
     assert finding.worst == pytest.approx(angle)
-
-
-def test_another_parent_is_no_jump_but_is_told() -> None:
-    samples = [moving("a", "box", k * 100 * MS, 0.0) for k in range(30)]
-    samples += [moving("b", "box", k * 100 * MS, 500.0) for k in range(30, 60)]
-    found = examine([*samples, static("a", "b", 1.0)])
-    assert facts(found.pop(("two parents", "box"))) == (1, 3 * SECOND, None, None)
-    assert found == {}
-
-
-def test_stamps_that_go_back_are_found_with_the_longest_way() -> None:
-    samples = drive(10)
-    samples[3], samples[5] = samples[5], samples[3]
-    found = examine(samples)
-    assert facts(found.pop(("stamps go back", "base"))) == (2, 4 * 100 * MS, 0.2, 300 * MS)
-    assert found == {}
-
-
-def test_stamps_ahead_of_their_arrival_are_found() -> None:
-    found = examine(drive(10), delay=-80 * MS)
-    assert facts(found.pop(("ahead", "base"))) == (10, 0, 0.08, 0)
-    assert found == {}
-    assert examine(drive(10), delay=-50 * MS) == {}
-
-
-def test_duplicate_stamps_are_found() -> None:
-    samples = drive(10)
-    found = examine([*samples, samples[4], samples[4], samples[7]])
-    assert facts(found.pop(("duplicate stamps", "base")))[:2] == (3, 400 * MS)
-    assert facts(found.pop(("stamps go back", "base")))[0] == 3
-    assert found == {}
 
 
 def test_a_gap_is_long_and_unusual() -> None:
@@ -134,20 +140,6 @@ def test_two_authorities_are_found_with_their_changes() -> None:
     found = examine(samples)
     assert facts(found["two authorities", "base"]) == (2, SECOND, None, None)
     assert found["two authorities", "base"].detail == "2 senders: 'slam', 'odometry'"
-
-
-def test_a_static_frame_that_changes_is_found_and_one_that_repeats_is_not() -> None:
-    samples = [static("base", "arm", float(x), stamp=at) for at, x in enumerate([1, 1, 2, 2, 3])]
-    found = examine(samples)
-    assert facts(found.pop(("static changes", "arm"))) == (2, 2, None, None)
-    assert found == {}
-
-
-def test_a_frame_of_both_kinds_is_found() -> None:
-    found = examine([static("odom", "base"), *drive(5)])
-    assert facts(found.pop(("two kinds", "base")))[:2] == (5, 0)
-    found.pop(("two authorities", "base"))
-    assert found == {}
 
 
 def test_trees_that_are_not_connected_are_found_by_the_newest_parents() -> None:

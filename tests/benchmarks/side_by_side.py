@@ -10,43 +10,27 @@ import pytest
 from beside import Ask, Table
 from cases import Case, Vector
 
-SYSTEM_PYTHON = "/usr/bin/python3"
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    # A test without its peer is skipped before it measures anything.
-    config.addinivalue_line("filterwarnings", "ignore:Benchmark fixture was not used at all")
-
 
 @pytest.fixture(scope="session")
 def table(request: pytest.FixtureRequest) -> Table:
     table = Table()
-    table.add("", "tfbus", "peer", "ratio", "wanted")
     request.config.pluginmanager.register(table)
     return table
 
 
-@pytest.fixture(scope="module")
-def tf2() -> Iterator[Ask | str]:
-    """Has the real tf2 of ROS 1, in a process of its own, measure one round of a case; or says why there is none.
+@pytest.fixture(scope="module", params=[("/usr/bin/python3",), (os.environ.get("ROS2_PYTHON"), "ros2")], ids=str)
+def tf2(request: pytest.FixtureRequest) -> Iterator[Ask | None]:
+    """Has the real tf2 of ROS 1 or ROS 2, in a process of its own, measure one round of a case; None if there is none.
 
-    For one file, because processes that a file leaves are killed.
+    The process is for one file, because processes that a file leaves are killed.
     """
-    yield from _peer(SYSTEM_PYTHON)
-
-
-@pytest.fixture(scope="module")
-def tf2_of_ros_2() -> Iterator[Ask | str]:
-    """As `tf2`, of ROS 2."""
-    yield from _peer(os.environ.get("ROS2_PYTHON", "the Python that ROS2_PYTHON names"), "ros2")
-
-
-def _peer(python: str, *arguments: str) -> Iterator[Ask | str]:
+    python, *arguments = request.param
+    if python is None:
+        pytest.skip("ROS2_PYTHON names no Python that has the tf2 of ROS 2")
     if not Path(python).exists():
-        yield f"no {python}"
+        yield None
         return
-    script = Path(__file__).with_name("tf2_peer.py")
-    command = [python, str(script), *arguments]
+    command = [python, str(Path(__file__).with_name("tf2_peer.py")), *arguments]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         requests, replies = process.stdin, process.stdout
         assert requests is not None
@@ -57,5 +41,4 @@ def _peer(python: str, *arguments: str) -> Iterator[Ask | str]:
             seconds, answer = json.loads(replies.readline())
             return seconds, answer
 
-        greeting = replies.readline().strip()
-        yield ask if greeting == "ready" else f"{python}: {greeting}"
+        yield ask if replies.readline() == "ready\n" else None

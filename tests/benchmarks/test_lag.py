@@ -10,12 +10,13 @@ from typing import Any
 
 import anyio
 import pytest
-from beside import Table
+from beside import Table, name_of
 
 from tfbus import SECOND, Buffer, Bus, RecorderStatistics, Transform, TransformBroadcaster
 from tfbus.recording import Recorder
 
 pytest_plugins = ["side_by_side"]
+
 pytestmark = pytest.mark.every_loop
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]
@@ -74,10 +75,6 @@ async def watch(buffer: Buffer, number: int, count: list[int]) -> None:
     with buffer.watch("base", f"f{number * 2}", max_rate=10.0) as changes:
         async for _ in changes:
             count[0] += 1
-
-
-def name_of(backend: Backend) -> str:
-    return "uvloop" if backend[1] else backend[0]
 
 
 def test_lag_under_load(table: Table, run: Run, anyio_backend: Backend) -> None:

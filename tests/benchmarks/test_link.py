@@ -8,19 +8,23 @@ from collections.abc import Iterator
 from statistics import median
 from typing import Any
 
+import anyio
 import pytest
 from beside import Table
-from presence import measure
-from support.processes import Crowd, PeerProcess, crowd, free_ports, new_domain
+from support.processes import Crowd, PeerProcess, crowd, free_address, new_domain, until
+
+from tfbus import Bus
+from tfbus.links.zenoh import ZenohLink
 
 pytest_plugins = ["side_by_side"]
 
 BACKENDS = ("asyncio", "asyncio+uvloop", "trio")
 SECONDS = 5.0
+SETTLE, RESTED = 30.0, 30.0
 BATCH = 20
 STATICS = [f"fixed {number}" for number in range(50)]
 
-# What a process that has a bus and a buffer needs more, in MB: for zenoh's library, and for the link.
+# The memory of a process with a bus and a buffer, in MB: alone, with zenoh's library, and with a link.
 MEMORY = """
 import json, os, sys
 import anyio
@@ -56,7 +60,7 @@ def processes() -> Iterator[Crowd]:
 
 def pair(processes: Crowd, backend: str, **options: Any) -> tuple[PeerProcess, PeerProcess]:
     """Two processes that know each other."""
-    domain, address = new_domain(), f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    domain, address = new_domain(), free_address()
     here = processes.add({"domain": domain, "listen": address, **options}, backend=backend)
     there = processes.add({"domain": domain, "connect": address, **options}, backend=backend)
     for process in (here, there):
@@ -106,7 +110,7 @@ def test_rate(backend: str, table: Table, processes: Crowd) -> None:
 
 
 def test_memory(table: Table, processes: Crowd) -> None:
-    domain, address = new_domain(), f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    domain, address = new_domain(), free_address()
     processes.add({"domain": domain, "listen": address}).ask("statics", names=STATICS)
     link = json.dumps({"domain": domain, "connect": address})
     done = subprocess.run([sys.executable, "-c", MEMORY, link], capture_output=True, text=True, check=True, timeout=60)
@@ -115,14 +119,30 @@ def test_memory(table: Table, processes: Crowd) -> None:
     table.add("memory that a link adds", f"{linked - before:.1f} MB", parts, "", "<= 15 MB")
 
 
-def test_presence_at_rest(table: Table) -> None:
-    links, bare, routed = measure(settle=60.0), measure(settle=60.0, bare=True), measure(settle=60.0, router=True)
-    floor = f"bare zenoh {bare:.2%}, behind a router {routed:.2%}"
-    table.add("of a core for 50 peers that rest", f"{links:.2%}", floor, f"{links / bare:.2f}", "0.5 % more")
+@pytest.mark.parametrize("peers", [0, 50])
+def test_presence_at_rest(table: Table, processes: Crowd, peers: int) -> None:
+    """The cost of knowing peers that do nothing. They know the measured link, but not each other."""
+    domain, address = new_domain(), free_address()
+    alone = {"scouting/gossip/enabled": False}
+    other = {"domain": domain, "connect": address, "robot": "other", "robots": ["one"], "config": alone}
+
+    async def main() -> float:
+        with Bus() as bus:
+            async with ZenohLink(bus, domain, robot="one", listen=address) as link:
+                for _ in range(2 if peers else 0):
+                    processes.begin(*[other] * (peers // 2))
+                await until(lambda: len(link.peers) == peers)
+                await anyio.sleep(SETTLE)
+                before, began = time.process_time(), time.monotonic()
+                await anyio.sleep(RESTED)
+                assert len(link.peers) == peers
+                return (time.process_time() - before) / (time.monotonic() - began)
+
+    table.add(f"of a core for {peers} peers that rest", f"{anyio.run(main):.2%}")
 
 
 def test_late_joiner(table: Table, processes: Crowd) -> None:
-    domain, address = new_domain(), f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    domain, address = new_domain(), free_address()
     first = processes.add({"domain": domain, "listen": address})
     first.ask("statics", names=STATICS)
     # Until they are cached, and not only on their way.
@@ -139,7 +159,7 @@ def test_late_joiner(table: Table, processes: Crowd) -> None:
 
 
 def test_death(table: Table, processes: Crowd) -> None:
-    domain, address = new_domain(), f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    domain, address = new_domain(), free_address()
     stays = processes.add({"domain": domain, "listen": address})
     times = []
     for _ in range(10):

@@ -3,8 +3,8 @@
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -12,9 +12,10 @@ from typing import Any
 import cases
 import numpy as np
 import pytest
-from beside import Table, build
+from beside import Table, Turn, build, take_turns, timed
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
+from support.processes import TFBUS
 
 from tfbus import Transform, TransformStamped
 from tfbus.recording import load
@@ -22,7 +23,6 @@ from tfbus.tf_message import decode, encode
 
 pytest_plugins = ["side_by_side"]
 
-MESSAGE_ROUNDS = 25
 CALLS = 200
 MESSAGE = "tf2_msgs/msg/TFMessage"
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -30,44 +30,12 @@ ROS = get_typestore(Stores.ROS2_JAZZY)
 
 def robot() -> list[TransformStamped]:
     """One batch of twenty frames, at places and in attitudes that need all digits."""
-    samples = [build(sample) for sample in cases.insertions("insert batches")[: cases.BATCH]]
+    samples = build(cases.insertions("insert batches")[: cases.BATCH])
     return [sample.replace(child=f"joint {place}") for place, sample in enumerate(samples)]
 
 
-def seconds_of(call: Callable[[], object]) -> float:
-    """Of one call."""
-    start = perf_counter()
-    for _ in range(CALLS):
-        call()
-    return (perf_counter() - start) / CALLS
-
-
-def compare(
-    table: Table, benchmark: Any, label: str, ours: Callable[[], object], peer: Callable[[], object], wanted: str = ""
-) -> None:
-    our_rounds: list[float] = []
-    peer_rounds: list[float] = []
-    benchmark.pedantic(
-        lambda: our_rounds.append(seconds_of(ours)),
-        setup=lambda: peer_rounds.append(seconds_of(peer)),
-        rounds=MESSAGE_ROUNDS,
-    )
-    table.compare(label, our_rounds, "rosbags", peer_rounds, wanted)
-
-
-def test_encoding(benchmark: Any, table: Table) -> None:
-    samples = robot()
-    payload = encode(samples)
-    message = ROS.deserialize_cdr(payload, MESSAGE)
-    assert bytes(ROS.serialize_cdr(message, MESSAGE)) == payload
-    compare(
-        table,
-        benchmark,
-        "encode 20 transforms",
-        lambda: encode(samples),
-        lambda: ROS.serialize_cdr(message, MESSAGE),
-        "<= 20 us",
-    )
+def repeated(call: Callable[[], object]) -> Turn:
+    return timed(lambda: [call() for _ in range(CALLS)], CALLS)
 
 
 def rounded(payload: bytes) -> bytes:
@@ -80,37 +48,25 @@ def rounded(payload: bytes) -> bytes:
     return bytes(ROS.serialize_cdr(message, MESSAGE))
 
 
-@pytest.mark.parametrize(
-    ("label", "precise", "little_endian"),
-    [
-        ("decode 20 transforms", True, True),
-        ("decode 20 transforms, to normalise", False, True),
-        ("decode 20 transforms, big endian", True, False),
-    ],
-)
-def test_decoding(benchmark: Any, table: Table, label: str, precise: bool, little_endian: bool) -> None:
+def test_messages(table: Table) -> None:
     samples = robot()
-    payload = encode(samples) if precise else rounded(encode(samples))
     tags = [(sample.authority, sample.static) for sample in samples]
-    if not little_endian:
-        message = ROS.deserialize_cdr(payload, MESSAGE)
-        payload = bytes(ROS.serialize_cdr(message, MESSAGE, little_endian=False))
-    decoded = decode(payload, tags).samples
-    if precise:
-        assert decoded == samples
-    compare(
-        table,
-        benchmark,
-        label,
-        lambda: decode(payload, tags),
-        lambda: ROS.deserialize_cdr(payload, MESSAGE),
-        "<= 40 us",
-    )
+    payload = encode(samples)
+    message = ROS.deserialize_cdr(payload, MESSAGE)
+    assert bytes(ROS.serialize_cdr(message, MESSAGE)) == payload
+    assert decode(payload, tags).samples == samples
+    big_endian = bytes(ROS.serialize_cdr(message, MESSAGE, little_endian=False))
+    ours, theirs = take_turns(repeated(lambda: encode(samples)), repeated(lambda: ROS.serialize_cdr(message, MESSAGE)))
+    table.compare("encode 20 transforms", ours, "rosbags", theirs, "<= 20 us")
+    for kind, data in (("", payload), (", to normalise", rounded(payload)), (", big endian", big_endian)):
+        ours, theirs = take_turns(
+            repeated(partial(decode, data, tags)), repeated(partial(ROS.deserialize_cdr, data, MESSAGE))
+        )
+        table.compare(f"decode 20 transforms{kind}", ours, "rosbags", theirs, "<= 40 us")
 
 
 # Recordings
 
-TFBUS = str(Path(sys.executable).with_name("tfbus"))
 FRAMES = 50
 SENDERS = 5
 START = 1_700_000_000_000_000_000
@@ -162,18 +118,16 @@ def test_load(table: Table, write: Write, at_once: int) -> None:
     table.add(f"load, {at_once} in a message", f"{sorted(rates)[ROUNDS // 2]:,.0f}/s", wanted=">= 50,000/s")
 
 
-@pytest.mark.parametrize("command", ["info", "query"])
-def test_a_million_transforms(table: Table, write: Write, command: str) -> None:
+@pytest.mark.parametrize(
+    ("command", "question", "wanted"),
+    [("info", ["--json"], "<= 30 s, 400 MB"), ("query", ["map", f"f{FRAMES - 1}", "--csv"], "")],
+)
+def test_a_million_transforms(table: Table, write: Write, command: str, question: list[str], wanted: str) -> None:
     path = write(MILLION, 1)
-    question = (
-        ["info", str(path), "--json"] if command == "info" else ["query", str(path), "map", f"f{FRAMES - 1}", "--csv"]
-    )
     start = perf_counter()
-    process = subprocess.Popen([TFBUS, *question], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen([TFBUS, command, path, *question], stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
-    seconds = perf_counter() - start
+    seconds, memory = perf_counter() - start, usage.ru_maxrss / 1024
     process.returncode = os.waitstatus_to_exitcode(status)
     assert process.returncode == 0
-    memory = usage.ru_maxrss / 1024
-    wanted = "<= 30 s, 400 MB" if command == "info" else ""
     table.add(f"{command}, a million transforms", f"{seconds:.1f} s, {memory:.0f} MB", wanted=wanted)

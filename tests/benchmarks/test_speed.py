@@ -1,12 +1,11 @@
 """The speed of tfbus beside its peers: `pytest tests/benchmarks` ends with a table. The default run leaves this out.
 
-Timings on a shared machine drift, so what counts is the ratio of two sides that take turns: the peer has its turn in
-the setup of each of pytest-benchmark's rounds. No test asserts a time.
+Timings on a shared machine drift, so what counts is the ratio of two sides that take turns. No test asserts a time.
 """
 
 import gc
 import tracemalloc
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from functools import partial
 from statistics import median
@@ -17,16 +16,14 @@ import anyio
 import anyio.lowlevel
 import cases
 import pytest
-from beside import Ask, Table, build, show
+from beside import ROUNDS, Ask, Table, Turn, build, last_of, name_of, show, take_turns
 from cases import AUTHORITY, BASE, START, Case, Pass, Vector
-from support.both_kernels import COMPILED, tfbus_on
 
 import tfbus
 from tfbus import Buffer, Bus, Transform, TransformStamped
 
 pytest_plugins = ["side_by_side"]
 
-ROUNDS = 25
 FEW_ROUNDS = 5
 HUNDRED = 100
 A_SECOND = 100_000
@@ -36,61 +33,51 @@ CROWD = 10_000
 
 Backend = tuple[str, dict[str, Any]]
 Run = Callable[[Callable[[], Awaitable[None]]], None]
-Calls = Sequence[TransformStamped | Sequence[TransformStamped]]
 
 
-def publish_all(bus: Bus, calls: Calls) -> float:
-    """Seconds in all."""
-    return call_with_each(bus.publish, calls)
-
-
-def call_with_each(call: Callable[[Any], object], calls: Calls) -> float:
+def call_with_each(call: Callable[[Any], object], arguments: list[Any]) -> float:
     """Seconds in all."""
     start = perf_counter()
-    for samples in calls:
-        call(samples)
+    for argument in arguments:
+        call(argument)
     return perf_counter() - start
 
 
-def publish_stamped(bus: Bus, parts: list[tuple[int, Transform]], stamped: type[TransformStamped]) -> float:
-    """As `publish_all`, with the making of the samples."""
-    publish = bus.publish
-    start = perf_counter()
-    for stamp, transform in parts:
-        publish(stamped(BASE, "f0", stamp, transform, AUTHORITY))
-    return perf_counter() - start
-
-
-def insert(kind: str, package: Any = tfbus) -> Pass:
-    """One pass on the kernel of this process, or on that of another copy of the package."""
-    samples = [build(sample, package) for sample in cases.insertions(kind)]
-    parts = [(sample.stamp, sample.transform) for sample in samples]
-    calls: Calls = samples
+def insert(kind: str, package: Any) -> Pass:
+    samples = build(cases.insertions(kind), package)
+    calls: list[Any] = samples
     if kind == "insert batches":
         calls = [samples[i : i + cases.BATCH] for i in range(0, len(samples), cases.BATCH)]
+    elif kind == "insert stamped":
+        calls = [(sample.stamp, sample.transform) for sample in samples]
+    stamped = package.TransformStamped
 
     def one_pass() -> tuple[float, Vector]:
         bus = package.Bus()
         buffer = package.Buffer(bus, cases.KEEP)
+        tree = buffer.tree
         if kind == "insert into the tree":
             tree = package.TransformTree(cases.KEEP)
-            return call_with_each(tree.insert, calls) / len(samples), tree.lookup(BASE, "f0").transform.translation
-        if kind == "insert stamped":
-            seconds = publish_stamped(bus, parts, package.TransformStamped)
+            seconds = call_with_each(tree.insert, calls)
+        elif kind == "insert stamped":
+            publish = bus.publish
+            start = perf_counter()
+            for stamp, transform in calls:
+                publish(stamped(BASE, "f0", stamp, transform, AUTHORITY))
+            seconds = perf_counter() - start
         else:
-            seconds = publish_all(bus, calls)
-        return seconds / len(samples), buffer.lookup_nowait(BASE, "f0").transform.translation
+            seconds = call_with_each(bus.publish, calls)
+        return seconds / len(samples), tree.lookup(BASE, "f0").transform.translation
 
     return one_pass
 
 
-def lookup(case: Case, package: Any = tfbus) -> Pass:
-    """As `insert`."""
+def lookup(case: Case, package: Any) -> Pass:
     bus = package.Bus()
     buffer = package.Buffer(bus, 2 * cases.KEEP)
-    bus.publish(build(sample, package) for sample in cases.history(case.chain))
+    bus.publish(build(cases.history(case.chain), package))
     stamps = [package.LATEST if case.kind == "lookup latest" else stamp for stamp in cases.questions(case.kind)]
-    source = f"f{len(case.chain) - 1}"
+    source = last_of(case.chain)
 
     def one_pass() -> tuple[float, Vector]:
         ask = buffer.lookup_nowait
@@ -102,85 +89,37 @@ def lookup(case: Case, package: Any = tfbus) -> Pass:
     return one_pass
 
 
+def passes(case: Case, package: Any) -> Pass:
+    return lookup(case, package) if case.chain else insert(case.kind, package)
+
+
 @pytest.mark.parametrize(
     ("label", "case", "wanted"),
     [
         ("publish 1, built beforehand", Case("insert"), "<= 0.4"),
         ("publish 1, stamped in the timing", Case("insert stamped"), "<= 1.0"),
         ("publish 20, each", Case("insert batches"), "<= 1.0"),
+        ("insert 1 into a tree", Case("insert into the tree"), "<= 0.4"),
         ("lookup, 1 edge", Case("lookup", "m"), "<= 0.07"),
         ("lookup, 3 edges", Case("lookup", "mmm"), "<= 0.08"),
-        ("lookup, 10 edges", Case("lookup", "mmmmmmmmmm"), "<= 0.15"),
+        ("lookup, 10 edges", Case("lookup", "m" * 10), "<= 0.15"),
         ("lookup, 10 edges, 7 of them static", Case("lookup", "msssmsssms"), ""),
+        ("lookup in the newest 0.1 s, 10 edges", Case("lookup newest", "m" * 10), "<= 0.15"),
         ("lookup LATEST, 1 edge", Case("lookup latest", "m"), ""),
         ("lookup LATEST, 3 edges", Case("lookup latest", "mmm"), ""),
-        ("lookup LATEST, 10 edges", Case("lookup latest", "mmmmmmmmmm"), ""),
-    ],
-)
-def test_beside_tf2(benchmark: Any, table: Table, tf2: Ask | str, label: str, case: Case, wanted: str) -> None:
-    if isinstance(tf2, str):
-        tf2 = f"no tf2 to measure beside ({tf2}); on Debian: apt-get install python3-tf2-ros"
-    beside(benchmark, table, tf2, label, case, wanted)
-
-
-@pytest.mark.parametrize(
-    ("label", "case", "wanted"),
-    [
-        ("lookup in the newest 0.1 s, 10 edges", Case("lookup newest", "m" * 10), "<= 0.15"),
         ("lookup LATEST, 10 edges", Case("lookup latest", "m" * 10), "<= 0.15"),
-        ("insert 1 into a tree", Case("insert into the tree"), "<= 0.4"),
-        ("publish 1, built beforehand", Case("insert"), "<= 0.4"),
     ],
 )
-def test_beside_tf2_of_ros_2(
-    benchmark: Any, table: Table, tf2_of_ros_2: Ask | str, label: str, case: Case, wanted: str
-) -> None:
-    if isinstance(tf2_of_ros_2, str):
-        pytest.skip(f"no tf2 of ROS 2 to measure beside: {tf2_of_ros_2}")
-    beside(benchmark, table, tf2_of_ros_2, f"ROS 2: {label}", case, wanted)
+def test_beside_tf2(table: Table, tf2: Ask | None, label: str, case: Case, wanted: str) -> None:
+    def on(package: Any) -> Turn:
+        one_pass = passes(case, package)
+        assert tf2 is None or one_pass()[1] == pytest.approx(tf2(case)[1], abs=1e-6)
+        return lambda: one_pass()[0]
+
+    table.measure(label, on, "tf2", None if tf2 is None else lambda: tf2(case)[0], wanted)
 
 
-def beside(benchmark: Any, table: Table, tf2: Ask | str, label: str, case: Case, wanted: str) -> None:
-    """Measure a case on both kernels beside a tf2, or say why there is none."""
-
-    def passes_on(package: Any) -> Pass:
-        return lookup(case, package) if case.chain else insert(case.kind, package)
-
-    other = "python" if tfbus.kernel == "compiled" else "compiled"
-    one_pass = passes_on(tfbus)
-    other_pass = passes_on(tfbus_on(other)) if other == "python" or COMPILED is not None else None
-    others: list[float] = []
-    peer: list[float] = []
-    expected: list[Vector] = []
-
-    def peers_turn() -> None:
-        if other_pass is not None:
-            others.append(other_pass()[0])
-        if not isinstance(tf2, str):
-            seconds, translation = tf2(case)
-            peer.append(seconds)
-            expected.append(translation)
-
-    ours: list[float] = []
-
-    def our_turn() -> Vector:
-        seconds, translation = one_pass()
-        ours.append(seconds)
-        return translation
-
-    answer = benchmark.pedantic(our_turn, setup=peers_turn, rounds=ROUNDS)
-    if isinstance(tf2, str):
-        table.add(label, show(ours, "us"), "no tf2")
-    else:
-        table.compare(label, ours, "tf2", peer, wanted)
-    if others:
-        table.compare(f"  on the {other} kernel", others, f"the {tfbus.kernel} one", ours)
-    if isinstance(tf2, str):
-        pytest.skip(tf2)
-    assert answer == pytest.approx(expected[-1], abs=1e-6)
-
-
-def hundred_frames(package: Any, *, built: bool) -> Callable[[], float]:
+def hundred_frames(package: Any, *, built: bool) -> Turn:
     """Publishes batches of one sample for each of a hundred frames, `built` before or not: seconds a sample."""
     frames = [f"f{i}" for i in range(HUNDRED)]
     stamps = range(START, START + 20 * cases.PERIOD // 10, cases.PERIOD // 10)
@@ -206,26 +145,11 @@ def hundred_frames(package: Any, *, built: bool) -> Callable[[], float]:
     return one_pass
 
 
-@pytest.mark.parametrize("built", [True, False])
-def test_a_hundred_frames_in_each_batch(table: Table, built: bool) -> None:
-    """With the making of the samples it is shown as the share of a core that a hundred frames at 1 kHz take."""
-    other = "python" if tfbus.kernel == "compiled" else "compiled"
-    sides = [hundred_frames(tfbus, built=built)]
-    if other == "python" or COMPILED is not None:
-        sides.append(hundred_frames(tfbus_on(other), built=built))
-    ours, *others = ([*rounds] for rounds in zip(*([side() for side in sides] for _ in range(ROUNDS)), strict=True))
-    if built:
-        table.add("publish 100, each", show(ours, "ns"))
-    else:
-        table.add(
-            "100 frames at 1 kHz, built and published", f"{median(ours) * A_SECOND:.1%} of a core", wanted="<= 9 %"
-        )
-    for rounds in others:
-        table.compare(f"  on the {other} kernel", rounds, f"the {tfbus.kernel} one", ours, unit="ns")
-
-
-def loop_name(backend: Backend) -> str:
-    return "uvloop" if backend[1] else backend[0]
+def test_a_hundred_frames_in_each_batch(table: Table) -> None:
+    built, whole = take_turns(hundred_frames(tfbus, built=True), hundred_frames(tfbus, built=False))
+    table.add("publish 100, each", show(built, "ns"))
+    share = f"{median(whole) * A_SECOND:.1%} of a core"
+    table.add("100 frames at 1 kHz, built and published", share, wanted="<= 9 %")
 
 
 def moving(child: str, count: int) -> list[TransformStamped]:
@@ -237,13 +161,11 @@ async def wake_up(
 ) -> float:
     """Seconds from the call of `wake` to the line after `wait`, in a task that was `waiting` by then."""
     woken = 0.0
-    done = anyio.Event()
 
     async def waiter() -> None:
         nonlocal woken
         await wait()
         woken = perf_counter()
-        done.set()
 
     async with anyio.create_task_group() as group:
         group.start_soon(waiter)
@@ -251,7 +173,6 @@ async def wake_up(
             await anyio.lowlevel.checkpoint()
         start = perf_counter()
         wake()
-        await done.wait()
     return woken - start
 
 
@@ -286,9 +207,9 @@ def test_wake_up(table: Table, run: Run, anyio_backend: Backend, timeout: float 
             events.append(median(peer for _, peer in pairs))
 
     run(take_turns)
-    name = loop_name(anyio_backend)
+    name = name_of(anyio_backend)
     with_timeout = timeout is not None
-    label = f"wake-up, {name}{', with a timeout' if with_timeout else ''}"
+    label = f"wake-up, {name}{', with a timeout' * with_timeout}"
     table.compare(label, lookups, "Event", events, WANTED[name][with_timeout])
 
 
@@ -311,21 +232,19 @@ def test_publishing_past_waiters(table: Table) -> None:
     buses = Bus(), Bus()
     buffer, _ = (Buffer(bus) for bus in buses)
     samples = moving("b", 1 + ROUNDS * 2_000)
-    chunks = (samples[first : first + 2_000] for first in range(1, len(samples), 2_000))
     for bus in buses:
         bus.publish([*moving("a", 1), samples[0]])
-    crowded: list[float] = []
-    empty: list[float] = []
+    rounds: list[list[float]] = []
 
     async def take_turns() -> None:
         async with crowd(partial(look_up_a, buffer)):
             assert len(buffer.pending()) == CROWD
-            for chunk in chunks:
-                with_crowd, without = (publish_all(bus, chunk) / len(chunk) for bus in buses)
-                crowded.append(with_crowd)
-                empty.append(without)
+            for first in range(1, len(samples), 2_000):
+                chunk = samples[first : first + 2_000]
+                rounds.append([call_with_each(bus.publish, chunk) / len(chunk) for bus in buses])
 
     anyio.run(take_turns)
+    crowded, empty = ([*seconds] for seconds in zip(*rounds, strict=True))
     table.compare("publish on B while 10,000 wait on A", crowded, "none", empty, "<= 1.1")
 
 
@@ -349,7 +268,7 @@ def test_cancelling(table: Table, run: Run, anyio_backend: Backend) -> None:
             sleepers.append(await cancel(lambda _: anyio.sleep_forever()))
 
     run(take_turns)
-    table.compare(f"cancel 10,000 waiters, {loop_name(anyio_backend)}", lookups, "sleep", sleepers, unit="ms")
+    table.compare(f"cancel 10,000 waiters, {name_of(anyio_backend)}", lookups, "sleep", sleepers, unit="ms")
 
 
 def test_memory(table: Table) -> None:
@@ -357,7 +276,7 @@ def test_memory(table: Table) -> None:
     bus = Bus()
     buffer = Buffer(bus)
     tracemalloc.start()
-    bus.publish(build(sample) for sample in cases.history(chain))
+    bus.publish(build(cases.history(chain)))
     gc.collect()
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()

@@ -1,3 +1,5 @@
+"""A broadcaster's samples, its mistakes and the frames that it owns."""
+
 import math
 from collections.abc import Callable
 
@@ -55,18 +57,9 @@ def test_send_static_holds_at_every_stamp_and_can_be_repeated() -> None:
         assert (found.stamp, found.transform, found.static) == (at, HERE.inverse(), True)
 
 
-NAN = math.nan
 BAD_CALLS: dict[str, Callable[[TransformBroadcaster], None]] = {
-    "NaN": lambda tf: tf.send("map", "a", Transform((0.0, NAN, 0.0))),
-    "infinity": lambda tf: tf.send("map", "a", Transform((0.0, -math.inf, 0.0))),
-    "NaN rotation": lambda tf: tf.send("map", "a", Transform(rotation=(0.0, 0.0, NAN, 1.0))),
-    "zero quaternion": lambda tf: tf.send("map", "a", Transform(rotation=(0.0, 0.0, 0.0, 0.0))),
-    "norm 1.02": lambda tf: tf.send("map", "a", Transform(rotation=(0.0, 0.0, 0.0, 1.02))),
-    "short translation": lambda tf: tf.send("map", "a", Transform((0.0, 0.0))),
-    "long rotation": lambda tf: tf.send("map", "a", Transform(rotation=(0.0, 0.0, 0.0, 1.0, 0.0))),
-    "empty child": lambda tf: tf.send("map", "", HERE),
+    "NaN": lambda tf: tf.send("map", "a", Transform((0.0, math.nan, 0.0))),
     "empty parent": lambda tf: tf.send("", "a", HERE),
-    "leading slash": lambda tf: tf.send("/map", "a", HERE),
     "child equal to parent": lambda tf: tf.send("a", "a", HERE),
     "cycle": lambda tf: tf.send("base", "map", HERE),
     "static cycle": lambda tf: tf.send_static("base", "map", HERE),
@@ -78,7 +71,6 @@ MISTAKES: dict[str, Callable[[TransformBroadcaster], None]] = {
     "float stamp": lambda tf: tf.send("map", "a", HERE, at=1.5),  # type: ignore[arg-type]
     "float stamp of a batch": lambda tf: tf.send_all([("map", "a", HERE)], at=1.5),  # type: ignore[arg-type]
     "numbers for a transform": lambda tf: tf.send("map", "a", (0.0, 0.0, 0.0)),  # type: ignore[arg-type]
-    "text for numbers": lambda tf: tf.send("map", "a", Transform("123")),  # type: ignore[arg-type]
     "number for a name": lambda tf: tf.send("map", 7, HERE),  # type: ignore[arg-type]
     "pair in a batch": lambda tf: tf.send_all([("map", "a")]),  # type: ignore[list-item]
     "no batch": lambda tf: tf.send_all(5),  # type: ignore[arg-type]

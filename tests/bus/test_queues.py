@@ -1,15 +1,14 @@
-""""""
+"""Streams of batches, and the queues behind them."""
 
 import copy
-from collections.abc import Awaitable, Callable, Iterable
-from functools import partial
+from collections.abc import Callable, Iterable
 
 import anyio
 import anyio.lowlevel
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.asking import Asked, driving, settle
+from support.asking import settle
 from support.samples import moving, static
 
 from tfbus import Bus, SimulatedClock, Stream, TransformStamped
@@ -95,28 +94,20 @@ async def test_a_jump_back_discards_pending_moving_samples(overflow: Overflow) -
         assert stream.dropped == 1
 
 
-def test_a_stream_may_be_made_before_a_loop_runs_and_read_on_several(
-    run: Callable[[Callable[[], Awaitable[None]]], None],
+@pytest.mark.parametrize(
+    ("capacity", "overflow", "error"),
+    [
+        (0, "conflate", ValueError),
+        (10, "block", ValueError),
+        (True, "conflate", TypeError),
+        (1.5, "conflate", TypeError),
+    ],
+)
+def test_a_stream_with_a_bad_capacity_or_overflow_is_not_registered(
+    capacity: int, overflow: Overflow, error: type[Exception]
 ) -> None:
     bus = Bus(SimulatedClock())
-    stream = bus.stream()
-
-    async def read_one(second: int) -> None:
-        async with anyio.create_task_group() as tasks:
-            asked = Asked(tasks, stream.__anext__)
-            await settle()
-            bus.publish(driving("map", "a", second))
-            await settle()
-            assert asked.answer == (driving("map", "a", second),)
-
-    for second in range(3):
-        run(partial(read_one, second))
-
-
-@pytest.mark.parametrize(("capacity", "overflow"), [(0, "conflate"), (10, "block")])
-def test_a_stream_with_a_bad_capacity_or_overflow_is_not_registered(capacity: int, overflow: Overflow) -> None:
-    bus = Bus(SimulatedClock())
-    with pytest.raises(ValueError, match=r"capacity|overflow"):
+    with pytest.raises(error, match=r"capacity|overflow"):
         bus.stream(capacity, overflow)
     bus.publish(moving("map", "a", 1))
     assert bus.statistics().queues == ()
@@ -127,15 +118,6 @@ def emptied(queue: SampleQueue) -> Batches:
     while (batch := queue.get()) is not None:
         batches.append(batch)
     return batches
-
-
-def test_the_newest_batch_stays_even_if_it_exceeds_the_capacity() -> None:
-    queue = SampleQueue(2, "drop_oldest")
-    large = tuple(moving("map", f"joint_{number}", 1) for number in range(5))
-    queue.put((moving("map", "a", 0),))
-    queue.put(large)
-    assert emptied(queue) == [large]
-    assert queue.dropped == 1
 
 
 def test_kept_static_samples_come_in_the_order_of_their_last_publication() -> None:
@@ -188,15 +170,6 @@ def test_conflated_moving_samples_are_counted_separately() -> None:
     # Offered 5: two gave way to newer ones, one to a static one, one was dropped for the capacity, one was read.
     assert (queue.conflated, queue.dropped) == (3, 1)
     assert queue.statistics("stream").conflated == 3
-
-
-@pytest.mark.parametrize(
-    ("capacity", "overflow", "error"),
-    [(0, "conflate", ValueError), (True, "conflate", TypeError), (1.5, "conflate", TypeError), (1, "grow", ValueError)],
-)
-def test_a_bad_capacity_or_overflow_is_an_error(capacity: int, overflow: Overflow, error: type[Exception]) -> None:
-    with pytest.raises(error):
-        SampleQueue(capacity, overflow)
 
 
 CHILDREN = st.sampled_from("abcd")

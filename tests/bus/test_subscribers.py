@@ -1,4 +1,4 @@
-""""""
+"""Callbacks for batches and removals, and the log, which tells each thing once."""
 
 import logging
 
@@ -14,6 +14,11 @@ Batch = tuple[TransformStamped, ...]
 
 def children(batches: list[Batch]) -> list[str]:
     return [sample.child for batch in batches for sample in batch]
+
+
+def noting(bus: Bus, log: list[object]) -> Registration:
+    """Note the children of each batch, and each frame that is removed."""
+    return bus.subscribe(lambda batch: log.append([sample.child for sample in batch]), log.append)
 
 
 def test_a_subscriber_gets_each_batch_as_a_tuple_until_it_is_closed() -> None:
@@ -47,22 +52,29 @@ def test_a_late_subscriber_gets_the_latched_static_samples_first() -> None:
     assert got[1:] == [(moving("map", "c", 2),)]
 
 
-def test_an_exception_of_a_subscriber_is_isolated_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_exception_of_a_callback_is_isolated_announced_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     bus = Bus(SimulatedClock())
-    got: list[Batch] = []
+    log: list[object] = []
 
     def clumsy(_batch: Batch) -> None:
         raise ValueError("spilt the coffee")
 
-    bus.subscribe(clumsy)
-    bus.subscribe(got.append)
-    for stamp in range(3):
-        bus.publish(moving("map", "a", stamp))
-    assert len(got) == 3
-    assert bus.statistics().callbacks_failed == 3
+    def forgetful(frame: str) -> None:
+        raise KeyError(frame)
+
+    bus.subscribe(clumsy, forgetful)
+    noting(bus, log)
+    with bus.events() as events:
+        for stamp in range(3):
+            bus.publish(moving("map", "a", stamp))
+            bus.remove_frame("a")
+        failed = [event for event in iter(events.queue.get, None) if isinstance(event, SubscriberFailed)]
+    assert log == [["a"], "a"] * 3
+    assert bus.statistics().callbacks_failed == 6
+    assert [type(event.error) for event in failed] == [ValueError, KeyError] * 3
+    assert all(name in event.subscriber for event, name in zip(failed, ["clumsy", "forgetful"] * 3, strict=True))
     (record,) = caplog.records
-    assert (record.name, record.levelno) == ("tfbus", logging.WARNING)
-    assert "clumsy" in record.getMessage()
+    assert (record.name, record.levelno, "clumsy" in record.getMessage()) == ("tfbus", logging.WARNING, True)
     assert record.exc_info is not None
     assert str(record.exc_info[1]) == "spilt the coffee"
 
@@ -210,11 +222,6 @@ def test_later_subscribers_get_only_static_samples_if_a_callback_sets_the_clock_
 # Removals
 
 
-def noting(bus: Bus, log: list[object]) -> Registration:
-    """Note the children of each batch, and each frame that is removed."""
-    return bus.subscribe(lambda batch: log.append([sample.child for sample in batch]), log.append)
-
-
 def test_removals_are_delivered_in_order_with_the_batches_until_the_subscriber_is_closed() -> None:
     bus = Bus(SimulatedClock())
     log: list[object] = []
@@ -294,28 +301,6 @@ def test_a_removal_in_a_removal_callback_is_delivered_to_every_subscriber() -> N
     assert logs[0] == [["arm", "tool"], "arm", "tool"]
     assert sorted(map(str, logs[1][1:])) == ["arm", "tool"]
     assert bus.statistics().callbacks_failed == 0
-
-
-def test_an_exception_of_a_removal_callback_is_isolated_and_announced(caplog: pytest.LogCaptureFixture) -> None:
-    bus = Bus(SimulatedClock())
-    log: list[object] = []
-
-    def clumsy(frame: str) -> None:
-        raise ValueError(frame)
-
-    bus.subscribe(lambda _: None, clumsy)
-    noting(bus, log)
-    with bus.events() as events:
-        for stamp in range(3):
-            bus.publish(moving("map", "a", stamp))
-            bus.remove_frame("a")
-        pending = [event for event in iter(events.queue.get, None) if isinstance(event, SubscriberFailed)]
-    assert log == [["a"], "a"] * 3
-    assert bus.statistics().callbacks_failed == 3
-    assert [str(event.error) for event in pending] == ["a", "a", "a"]
-    assert all("clumsy" in event.subscriber for event in pending)
-    (record,) = caplog.records
-    assert "clumsy" in record.getMessage()
 
 
 def test_a_registration_closed_in_a_removal_callback_ends_both_callbacks() -> None:

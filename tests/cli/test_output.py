@@ -6,21 +6,18 @@ import io
 import logging
 import os
 import re
-import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from support.processes import PATIENCE, TFBUS
-from support.recorded import SMALL
-from support.terminal import Terminal, on_a_terminal
+from support.commands import Terminal
 
 from tfbus import Transform
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.output import (
     Column,
-    cells,
     csv_name,
     csv_writer,
     format_counts,
@@ -31,7 +28,6 @@ from tfbus.cli.output import (
     print_now,
     say,
     shorten,
-    shorten_widest,
     table_lines,
     terminal_width,
     track,
@@ -144,11 +140,6 @@ def test_a_pipe_has_room_for_any_line_unless_the_environment_says_otherwise(monk
     assert isinstance(terminal_width(), int)
 
 
-@pytest.mark.parametrize(("text", "width"), [("", 0), ("map", 3), ("雷达", 4), ("e\u0301", 1), ("Straße", 6)])
-def test_a_wide_letter_takes_two_columns_and_a_combining_mark_none(text: str, width: int) -> None:
-    assert cells(text) == width
-
-
 @pytest.mark.parametrize(
     ("text", "width", "shortened"),
     [
@@ -173,43 +164,34 @@ def test_a_line_is_broken_between_words_and_a_longer_word_is_shortened() -> None
     assert wrapped("at /a/very/long/path it is", 10, 2) == ["at", "  /a/…path", "  it is"]
 
 
-def test_the_widest_columns_give_way_first() -> None:
-    assert shorten_widest([20, 10, 3], 40) == [20, 10, 3]
-    assert shorten_widest([20, 10, 3], 28) == [15, 10, 3]
-    assert shorten_widest([20, 10, 3], 21) == [9, 9, 3]
-    assert shorten_widest([20, 10, 3], 5) == [8, 8, 3]
-    assert shorten_widest([], 5) == []
-
-
 COLUMNS = (Column("name"), Column("least", importance=1), Column("count", right=True, importance=2))
 ROWS = [("a", "xyz", "1"), ("long name", "w", "1,000")]
 
 
-def test_columns_are_as_wide_as_their_cells_and_numbers_stand_at_the_right() -> None:
-    assert list(table_lines(COLUMNS, ROWS, None)) == [
-        "name       least  count",
-        "a          xyz        1",
-        "long name  w      1,000",
-    ]
-    assert list(table_lines(COLUMNS, ROWS, 23)) == list(table_lines(COLUMNS, ROWS, None))
+LINKS = [("left_shoulder_link", "fixed"), ("arm", "revolute")]
+WHOLE = ["name       least  count", "a          xyz        1", "long name  w      1,000"]
 
 
-def test_the_least_important_columns_go_first_where_they_do_not_fit() -> None:
-    assert list(table_lines(COLUMNS, ROWS, 22)) == ["name       count", "a              1", "long name  1,000"]
-    assert list(table_lines(COLUMNS, ROWS, 15)) == ["name", "a", "long name"]
-
-
-def test_columns_that_stay_always_are_shortened_but_to_eight_columns_at_least() -> None:
-    columns = (Column("name"), Column("kind"))
-    rows = [("left_shoulder_link", "fixed"), ("arm", "revolute")]
-    assert list(table_lines(columns, rows, 20)) == ["name        kind", "left…_link  fixed", "arm         revolute"]
-    assert list(table_lines(columns, rows, 3))[1] == "lef…link  fixed"
-
-
-def test_empty_columns_and_titles_are_left_out_and_wide_letters_take_two_columns() -> None:
-    assert list(table_lines(COLUMNS, [("a", "", "1")], None)) == ["name  count", "a         1"]
-    assert list(table_lines(COLUMNS, [], None, titles=False)) == []
-    assert list(table_lines(COLUMNS[::2], [("雷达", "1"), ("abcd", "2")], None, titles=False)) == ["雷达  1", "abcd  2"]
+@pytest.mark.parametrize(
+    ("columns", "rows", "width", "titles", "lines"),
+    [
+        (COLUMNS, ROWS, None, True, WHOLE),
+        (COLUMNS, ROWS, 23, True, WHOLE),
+        # The least important columns go first; the others are shortened, but to eight columns at least.
+        (COLUMNS, ROWS, 22, True, ["name       count", "a              1", "long name  1,000"]),
+        (COLUMNS, ROWS, 15, True, ["name", "a", "long name"]),
+        (COLUMNS[:1] * 2, LINKS, 20, False, ["left…_link  fixed", "arm         revolute"]),
+        (COLUMNS[:1] * 2, LINKS, 3, False, ["lef…link  fixed", "arm       revolute"]),
+        # A column without cells is left out, and a wide letter takes two columns.
+        (COLUMNS, [("a", "", "1")], None, True, ["name  count", "a         1"]),
+        (COLUMNS, [], None, False, []),
+        (COLUMNS[::2], [("雷达", "1"), ("abcd", "2")], None, False, ["雷达  1", "abcd  2"]),
+    ],
+)
+def test_a_table_has_the_columns_that_fit_with_numbers_at_the_right(
+    columns: Sequence[Column], rows: list[tuple[str, ...]], width: int | None, titles: bool, lines: list[str]
+) -> None:
+    assert list(table_lines(columns, rows, width, titles)) == lines
 
 
 def test_the_bar_is_on_standard_error_and_leaves_the_output_alone(
@@ -227,26 +209,6 @@ def test_the_bar_is_on_standard_error_and_leaves_the_output_alone(
     assert shown.count("notice\n") == 3
     # At its end, the bar erases its line.
     assert shown.endswith("\x1b[2K")
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("command", "steps"),
-    [
-        (("info", str(SMALL)), ["reading"]),
-        (("query", str(SMALL), "map", "box", "--every", "0.001", "--json"), ["reading", "looking up"]),
-    ],
-)
-def test_on_a_terminal_a_command_prints_the_same_beside_its_bar(
-    tmp_path: Path, command: tuple[str, ...], steps: list[str]
-) -> None:
-    plain = subprocess.run([TFBUS, *command], capture_output=True, text=True, timeout=PATIENCE, check=True)
-    status, shown = on_a_terminal(tmp_path / "output", *command)
-    assert status == 0
-    assert (tmp_path / "output").read_text() == plain.stdout
-    for step in steps:
-        assert step in shown
-        assert step not in plain.stderr
 
 
 LOGGER = logging.getLogger("tfbus")

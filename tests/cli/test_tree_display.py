@@ -3,7 +3,7 @@
 import sys
 
 import pytest
-from support.terminal import Terminal
+from support.commands import Terminal
 
 from tfbus import SECOND, Edge
 from tfbus.cli.tree_display import TreeDisplay, tree_lines

@@ -10,15 +10,12 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from hypothesis import given
 from support.samples import moving, tree_of
 from support.stamped_data import ANSWER, HOLDERS, ONE_OF_EACH, VALUES, arrays_of, contents, name_of
-from support.strategies import data_stamps, frame_names
 
 from tfbus import (
     InvalidTransformError,
     LaserScan,
-    Latest,
     PointCloud,
     PointStamped,
     Polygon,
@@ -39,14 +36,6 @@ TRIPLES = [
     pytest.param(lambda value: WrenchStamped("map", 0, value, (0.0, 0.0, 0.0)).force, id="force"),
     pytest.param(lambda value: WrenchStamped("map", 0, (0.0, 0.0, 0.0), value).torque, id="torque"),
 ]
-
-
-@given(frame_names(), data_stamps())
-def test_any_frame_and_stamp_are_kept(frame: str, stamp: int | Latest) -> None:
-    for data in ONE_OF_EACH:
-        kept = replace(data, frame=frame, stamp=stamp)
-        assert kept.frame == frame
-        assert kept.stamp == stamp
 
 
 @dataclass(init=False, frozen=True)
@@ -71,19 +60,10 @@ def test_a_frame_is_a_name_and_a_stamp_an_int_or_latest(data: Any) -> None:
 
 
 @pytest.mark.parametrize("build", TRIPLES)
-@pytest.mark.parametrize("numbers", [[1, 2, 3], np.array([1, 2, 3]), np.array([1, 2, 3], np.float32)])
-def test_three_numbers_of_any_kind_become_a_tuple_of_floats(build: Any, numbers: Any) -> None:
-    triple = build(numbers)
-    assert triple == (1.0, 2.0, 3.0)
-    assert [type(part) for part in triple] == [float, float, float]
-
-
-@pytest.mark.parametrize("build", TRIPLES)
-def test_three_numbers_may_be_nan_or_infinite(build: Any) -> None:
-    missing, beyond, there = build((math.nan, -math.inf, -0.0))
-    assert math.isnan(missing)
-    assert beyond == -math.inf
-    assert math.copysign(1.0, there) == -1.0
+def test_three_numbers_of_any_kind_become_a_tuple_of_floats_also_if_they_are_not_finite(build: Any) -> None:
+    for numbers in ([1, 2, 3], np.array([1, 2, 3]), np.array([1, 2, 3], np.float32)):
+        assert repr(build(numbers)) == "(1.0, 2.0, 3.0)"
+    assert repr(build((math.nan, -math.inf, -0.0))) == "(nan, -inf, -0.0)"
 
 
 @pytest.mark.parametrize("build", TRIPLES)
@@ -217,38 +197,22 @@ def test_small_arrays_are_copied() -> None:
 
 
 @pytest.mark.parametrize("build", POINTS_OF)
-@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.float16])
-def test_floats_keep_their_dtype(build: Any, dtype: Any) -> None:
-    assert build(np.zeros((2, 3), dtype)).dtype == dtype
+def test_points_keep_a_dtype_of_floats_and_other_numbers_become_float64(build: Any) -> None:
+    for dtype, kept in (("f2", "f2"), ("f4", "f4"), ("f8", "f8"), ("i8", "f8"), ("u1", "f8")):
+        points = build(np.array([(1, 2, 3)], dtype))
+        assert (points.dtype, points.tolist()) == (np.dtype(kept), [[1.0, 2.0, 3.0]])
+    assert np.isnan(build([(1.0, 2.0, 3.0), (np.nan,) * 3])).tolist() == [[False] * 3, [True] * 3]
 
 
 @pytest.mark.parametrize("build", POINTS_OF)
-@pytest.mark.parametrize("dtype", [np.int64, np.uint8])
-def test_integers_become_float64(build: Any, dtype: Any) -> None:
-    points = build(np.array([(1, 2, 3)], dtype))
-    assert points.dtype == np.float64
-    assert points.tolist() == [[1.0, 2.0, 3.0]]
-
-
-@pytest.mark.parametrize("build", POINTS_OF)
-def test_lists_and_missing_points_are_allowed(build: Any) -> None:
-    points = build([(1.0, 2.0, 3.0), (np.nan, np.nan, np.nan)])
-    assert np.isnan(points).tolist() == [[False] * 3, [True] * 3]
-
-
-@pytest.mark.parametrize("build", POINTS_OF)
-@pytest.mark.parametrize("shape", [(0,), (3,), (2, 2), (2, 4), (3, 3, 3), ()])
-def test_points_of_another_shape_are_refused_with_the_shape(build: Any, shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"points must have shape \(n, 3\), got") as caught:
-        build(np.zeros(shape))
-    assert str(caught.value).endswith(f"got {shape}")
-
-
-@pytest.mark.parametrize("build", POINTS_OF)
-@pytest.mark.parametrize("wrong", [[("1", "2", "3")], [(True, False, True)], [(1j, 0, 0)], [(None, None, None)]])
-def test_points_of_another_dtype_are_refused_with_the_dtype(build: Any, wrong: Any) -> None:
-    with pytest.raises(TypeError, match="points must be numbers, not of dtype"):
-        build(wrong)
+def test_points_of_another_shape_or_dtype_are_refused_with_it(build: Any) -> None:
+    for shape in ((0,), (3,), (2, 2), (2, 4), (3, 3, 3), ()):
+        with pytest.raises(ValueError, match=r"points must have shape \(n, 3\), got") as caught:
+            build(np.zeros(shape))
+        assert str(caught.value).endswith(f"got {shape}")
+    for wrong in ([("1", "2", "3")], [(True, False, True)], [(1j, 0, 0)], [(None, None, None)]):
+        with pytest.raises(TypeError, match="points must be numbers, not of dtype"):
+            build(wrong)
 
 
 MASKED: Any = np.ma.array(np.ones((2, 3)), mask=[[False, True, False], [False] * 3])

@@ -6,22 +6,7 @@ from itertools import product
 from operator import itemgetter
 
 from bags import transforms_in
-from steps import (
-    LATEST,
-    SECOND,
-    Scenario,
-    Stamp,
-    Step,
-    bag,
-    can,
-    can_travel,
-    clear,
-    latest,
-    lookup,
-    sample,
-    static,
-    travel,
-)
+from steps import LATEST, SECOND, Scenario, Stamp, Step
 
 BAGS = {"pr2_tf.bag": 1_795_275_600, "turtlesim.bag": 1_396_293_880}
 """Each with the whole seconds that are taken off: below four million of them a float holds every nanosecond."""
@@ -50,7 +35,7 @@ def random_tree(seed: int) -> Scenario:
     steps = samples[:cut]
     steps += _questions(rng, steps, 15)
     if rng.random() < 0.05:
-        steps.append(clear())
+        steps.append({"clear": []})
         steps += _questions(rng, samples[:cut], 6)
     steps += samples[cut:]
     steps += _questions(rng, samples, 20)
@@ -60,12 +45,14 @@ def random_tree(seed: int) -> Scenario:
 def _history(rng: random.Random, above: list[str], child: str) -> list[Step]:
     parent = rng.choice(above)
     if rng.random() < 0.3:
-        return [static(parent, child, _vector(rng), _unit(rng))]
+        return [{"insert static": [parent, child, 0, _vector(rng), _unit(rng)]}]
     first = 20 * SECOND + rng.choice((0, 0, rng.randrange(10 * SECOND)))
     stamps = {first + rng.randrange(12 * SECOND) for _ in range(rng.choice((0, 2, 3, 4, 5)))} | {first}
     switch = rng.choice(sorted(stamps)) if rng.random() < 0.15 else max(stamps) + 1
     other = rng.choice(above)
-    return [sample(other if at >= switch else parent, child, at, _vector(rng), _unit(rng)) for at in sorted(stamps)]
+    return [
+        {"insert": [other if at >= switch else parent, child, at, _vector(rng), _unit(rng)]} for at in sorted(stamps)
+    ]
 
 
 def _vector(rng: random.Random) -> list[float]:
@@ -123,14 +110,15 @@ def _questions(rng: random.Random, samples: list[Step], count: int) -> list[Step
         target, source = ends
         kind = rng.random()
         if kind < 0.65:
-            questions.append(lookup(target, source, _instant(rng, stamps)))
+            questions.append({"lookup": [target, source, _instant(rng, stamps)]})
         elif kind < 0.85:
-            ask = can_travel if kind < 0.68 else travel
-            questions.append(ask(target, source, _instant(rng, stamps), _instant(rng, stamps), rng.choice(names)))
+            verb = "can" if kind < 0.68 else "lookup"
+            instants = _instant(rng, stamps), _instant(rng, stamps)
+            questions.append({verb: [target, source, *instants, rng.choice(names)]})
         elif kind < 0.93:
-            questions.append(can(target, source, _instant(rng, stamps)))
+            questions.append({"can": [target, source, _instant(rng, stamps)]})
         else:
-            questions.append(latest(target, source))
+            questions.append({"latest": [target, source]})
     return questions
 
 
@@ -173,14 +161,14 @@ def _bag_scenario(name: str, keep: float, count: int) -> Scenario:
             inexact.append((last[child][0], at))
         last[child] = at, rotation
     frames, stamps = sorted(names), sorted(moving)
-    steps = [bag(name, shift)]
+    steps: list[Step] = [{"bag": [name, shift]}]
     for number in range(count):
         target, source, fixed = rng.choice(frames), rng.choice(frames), rng.choice(frames)
         instant, source_instant = (_recorded_instant(rng, stamps, inexact) for _ in range(2))
         if number % 6 == 0:
-            steps.append(travel(target, source, instant, source_instant, fixed))
+            steps.append({"lookup": [target, source, instant, source_instant, fixed]})
         else:
-            steps.append(lookup(target, source, instant))
+            steps.append({"lookup": [target, source, instant]})
     return Scenario(f"{name}, {keep:g} s kept", steps, keep=keep)
 
 

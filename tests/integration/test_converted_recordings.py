@@ -1,27 +1,23 @@
-"""The files of `convert`, read by npm's reader of MCAP, and answered from by the real tf2."""
+"""The files of `convert`, read by npm's reader of MCAP."""
 
 import base64
 import json
-import os
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import pytest
 from mcap.reader import make_reader
-from rosbags.typesys import Stores, get_typestore
 from support.recorded import Line, write_mcap
 from support.samples import static
 
 from tfbus import SECOND, Transform, TransformStamped
-from tfbus.recording import convert, load
+from tfbus.recording import convert
 from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.thorough
 
-TYPES = get_typestore(Stores.ROS2_HUMBLE)
-TF = "tf2_msgs/msg/TFMessage"
 PACKAGES = ("@mcap/core@2", "fzstd@0.1")
 START = 1_700_000_000 * SECOND
 
@@ -40,29 +36,6 @@ for (let record; (record = reader.nextRecord()); ) {
   console.log(JSON.stringify([topic, messageEncoding, String(record.logTime), data]));
 }
 if (!reader.done()) throw new Error("the file ends too early");
-"""
-
-ASK_TF2 = """
-import json, sys
-import tf2_py
-from geometry_msgs.msg import TransformStamped
-from rclpy.duration import Duration
-from rclpy.time import Time
-asked = json.load(sys.stdin)
-core = tf2_py.BufferCore(Duration(seconds=100_000))
-for parent, child, stamp, numbers, static in asked["samples"]:
-    message = TransformStamped()
-    message.header.frame_id, message.child_frame_id = parent, child
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-    t, r = message.transform.translation, message.transform.rotation
-    t.x, t.y, t.z, r.x, r.y, r.z, r.w = numbers
-    (core.set_transform_static if static else core.set_transform)(message, "convert")
-answers = []
-for target, source, stamp in asked["questions"]:
-    found = core.lookup_transform_core(target, source, Time(nanoseconds=stamp)).transform
-    t, r = found.translation, found.rotation
-    answers.append([t.x, t.y, t.z, r.x, r.y, r.z, r.w])
-print(json.dumps(answers))
 """
 
 
@@ -123,59 +96,3 @@ def test_npm_s_reader_finds_the_same_messages(tmp_path: Path, source: Path, node
             payloads = [base64.b64decode(data) for *_, data in found]
             assert payloads[1:] == [encode(arm(k)) for k in range(60)]
             assert all(encoding == "cdr" for _, encoding, _, _ in found)
-
-
-@pytest.fixture(scope="module")
-def ros2python() -> str:
-    """A Python of ROS 2 with the real tf2."""
-    for python in (os.environ.get("ROS2PYTHON", ""), "ros2python", "python3", "/usr/bin/python3"):
-        path = shutil.which(python) if python else None
-        if (
-            path
-            and not subprocess.run([path, "-c", "import tf2_py, rclpy"], capture_output=True, check=False).returncode
-        ):
-            return path
-    pytest.skip("no Python has ROS 2's tf2_py; ROS2PYTHON names one")
-
-
-def numbers_of(transform: Any) -> list[float]:
-    return [getattr(transform.translation, axis) for axis in "xyz"] + [
-        getattr(transform.rotation, axis) for axis in "xyzw"
-    ]
-
-
-def test_the_real_tf2_gives_the_same_answers_from_what_convert_wrote(
-    tmp_path: Path, source: Path, ros2python: str
-) -> None:
-    database, path = tmp_path / "run.db3", tmp_path / "run.mcap"
-    convert([source], database)
-    convert([database], path)
-    samples = []
-    # Decoded by the official reader and by rosbags, not by tfbus.
-    with path.open("rb") as file:
-        for _, channel, message in make_reader(file).iter_messages():
-            decoded: Any = TYPES.deserialize_cdr(message.data, TF)
-            for each in decoded.transforms:
-                stamp = each.header.stamp.sec * SECOND + each.header.stamp.nanosec
-                samples.append(
-                    (
-                        each.header.frame_id,
-                        each.child_frame_id,
-                        stamp,
-                        numbers_of(each.transform),
-                        "static" in channel.topic,
-                    )
-                )
-    tree = load(source)
-    questions = [
-        (target, child, START + k * 77_777_777)
-        for k in range(75)
-        for target, child in (("map", "arm"), ("map", "camera"), ("camera", "rig"), ("rig", "map"))
-    ]
-    asked = json.dumps({"samples": samples, "questions": questions})
-    done = subprocess.run([ros2python, "-c", ASK_TF2], input=asked, capture_output=True, text=True, check=True)
-    answers = json.loads(done.stdout)
-    assert len(answers) == len(questions) == 300
-    for (target, child, stamp), answer in zip(questions, answers, strict=True):
-        ours = tree.lookup(target, child, stamp).transform
-        assert ours.is_close(Transform(answer[:3], answer[3:])), (target, child, stamp)

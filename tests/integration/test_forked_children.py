@@ -76,7 +76,7 @@ async def main():
     with Bus(max_ahead=None, max_behind=None) as bus, Buffer(bus) as buffer:
         one, two = TransformBroadcaster(bus), ({ENTERED[kind]})
         def child():
-            # What it has heard so far is there.
+            # It has what it had heard before the fork.
             print(buffer.lookup_nowait("map", "base").stamp)
             tell(bus.publish, sample(2))
             tell(bus.publish, [sample(2), sample(3)])
@@ -165,7 +165,7 @@ entered = ZenohLink(Bus(), listen="tcp/127.0.0.1:0")
 anyio.run(enter, entered)
 tell(anyio.run, enter, ZenohLink(Bus(), config={{"mode": "client"}}, connect="tcp/127.0.0.1:1"))
 tell(ZenohLink, Bus(), "no domain")
-# One that goes at once, and those that the program keeps to its end; the copies of a child are no others.
+# One link goes at once, the program keeps four to its end; the copies in a child are not told of again.
 RmwZenohLink(Bus())
 kept = [ZenohLink(Bus()), RosbridgeLink(Bus(), "ws://127.0.0.1:9090"), BufferServer(Buffer(Bus())), BufferClient()]
 in_a_child(lambda: sys.exit())

@@ -12,10 +12,13 @@ from typing import NamedTuple
 
 import pytest
 
+import tfbus
 from tfbus.cli.application import application
 
 ROOT = Path(__file__).parents[2]
 GUIDE = ROOT / "demos" / "guide"
+README = (ROOT / "README.md").read_text()
+TF2 = (GUIDE / "tf2.md").read_text()
 PAGES = [ROOT / "README.md", *sorted(GUIDE.glob("*.md"))]
 REFERENCE = sorted((GUIDE / "reference").glob("*.rst"))
 PUBLIC = [
@@ -60,7 +63,7 @@ def anchors_of(page: Path) -> set[str]:
 
 
 def commands_of(page: Path) -> list[str]:
-    """The command lines of a page, without comments; those that are joined by ``&&`` each for itself."""
+    """The command lines of a page, without comments; commands that ``&&`` joins count one by one."""
     lines = [line for match in CONSOLE.finditer(page.read_text()) for line in (match[1] or match[2]).splitlines()]
     commands = [part.strip() for line in lines for part in line.partition(" # ")[0].split("&&")]
     return [command for command in commands if re.match(r"(tfbus|pip install) ", command)]
@@ -147,3 +150,54 @@ def test_every_public_name_is_on_one_page_of_the_reference() -> None:
         ]
         for name in getattr(module, "__all__", own):
             assert id(getattr(module, name)) in documented, f"{path}.{name} is on no page of the reference"
+
+
+# The README
+
+
+def test_the_examples_of_the_readme_print_what_their_comments_say(capsys: pytest.CaptureFixture[str]) -> None:
+    for block in blocks_of(ROOT / "README.md")[:2]:
+        exec(compile(block.program, "README.md", "exec"), {"__name__": "__main__"})
+    output = capsys.readouterr().out
+    for said in ("(1.1, 0.2, 0.2)", "translation=(1.5, 0.0, 0.0)", "did you mean 'base_link'?"):
+        assert said in output
+
+
+def test_the_examples_and_the_whole_are_as_short_as_promised() -> None:
+    assert len(blocks_of(ROOT / "README.md")[0].program.strip().splitlines()) <= 12
+    assert len(README.splitlines()) <= 150
+
+
+def test_every_name_that_the_table_for_tf2_users_mentions_exists() -> None:
+    table = TF2.partition("## Names")[2].partition("## ")[0]
+    ours = "".join(line.split("|")[2] for line in table.splitlines() if line.count("|") == 3)
+    owners = {"buffer": tfbus.Buffer, "tree": tfbus.TransformTree, "broadcaster": tfbus.TransformBroadcaster}
+    methods = re.findall(r"\b(buffer|tree|broadcaster)\.(\w+)", ours)
+    assert methods
+    for owner, method in methods:
+        assert hasattr(owners[owner], method), f"{owner}.{method}"
+    for name in re.findall(r"\b([A-Z]\w+)\(|`(\w+Error)`", ours):
+        assert hasattr(tfbus, name[0] or name[1])
+
+
+def test_the_picture_is_what_describe_shows() -> None:
+    clock = tfbus.SimulatedClock()
+    with tfbus.Bus(clock) as bus, tfbus.Buffer(bus) as buffer:
+        calibration = tfbus.TransformBroadcaster(bus, authority="calibration")
+        calibration.send_static("base_link", "base_laser", tfbus.Transform((0.1, 0.0, 0.2)))
+        calibration.send_static("base_link", "camera", tfbus.Transform((0.3, 0.0, 0.5)))
+        slam = tfbus.TransformBroadcaster(bus, authority="slam")
+        odometry = tfbus.TransformBroadcaster(bus, authority="odometry")
+        for tick in range(1001):
+            odometry.send("odom", "base_link", tfbus.Transform(), at=tick * 10_000_000)
+        for tick in range(100):
+            slam.send("map", "odom", tfbus.Transform(), at=tick * 100_000_000 + 63_000_000)
+        clock.set(tfbus.from_seconds(10.004))
+        picture = buffer.describe()
+    assert f"```\n{picture}\n```" in README
+
+
+@pytest.mark.parametrize("command", ['pip install ".[cli]" && tfbus demo', 'pip install ".[test]" && pytest'])
+def test_both_commands_are_what_ci_types(command: str) -> None:
+    assert f"    {command}\n" in README
+    assert command in (ROOT / ".ci" / "run").read_text()

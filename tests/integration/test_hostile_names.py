@@ -9,10 +9,12 @@ import html.parser
 import io
 import json
 import logging
+import os
 import types
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -104,11 +106,6 @@ def lines_of(text: str) -> list[str]:
     return lines
 
 
-def check(make: Callable[[Sequence[str]], str]) -> None:
-    """Check that a text has no control characters, and as many lines with all names as with plain ones."""
-    assert len(lines_of(make(NAMES))) == len(lines_of(make(PLAIN)))
-
-
 def check_each(make: Callable[[str], str]) -> None:
     """Check the texts that are made with one name each."""
     count = len(lines_of(make("plain")))
@@ -155,19 +152,15 @@ def test_every_error_is_one_line(kind: type[TransformError]) -> None:
 
 def test_errors_that_are_made_of_a_text_are_one_line() -> None:
     def make(name: str) -> str:
-        return "\n".join(
-            map(
-                str,
-                (
-                    errors.RecordingError(name, path=name, reason="damaged"),
-                    errors.MissingRecordingError(path=name),
-                    errors.InvalidRobotError(name, element=f"<joint name={name!r}>"),
-                    InvalidTransformError(name, reason="frame name"),
-                    errors.BusClosedError(name),
-                    MalformedMessageError("text", name),
-                ),
-            )
+        made = (
+            errors.RecordingError(name, path=name, reason="damaged"),
+            errors.MissingRecordingError(path=name),
+            errors.InvalidRobotError(name, element=f"<joint name={name!r}>"),
+            InvalidTransformError(name, reason="frame name"),
+            errors.BusClosedError(name),
+            MalformedMessageError("text", name),
         )
+        return "\n".join(map(str, made))
 
     check_each(make)
 
@@ -176,6 +169,10 @@ def test_errors_that_are_made_of_a_text_are_one_line() -> None:
 def test_every_event_is_one_line(kind: Any) -> None:
     hints = get_type_hints(kind)
     check_each(lambda name: str(kind(**{field.name: value_of(hints[field.name], name) for field in fields(kind)})))
+
+
+html_of: Callable[[TransformTree], str] = methodcaller("_repr_html_")
+"""As Jupyter asks for it."""
 
 
 def tree_with(names: Sequence[str]) -> TransformTree:
@@ -191,7 +188,7 @@ def tree_with(names: Sequence[str]) -> TransformTree:
         TransformTree.to_dot,
         TransformTree.to_yaml,
         lambda tree: tree.to_dot(now=SECOND),
-        TransformTree._repr_html_,
+        html_of,
         repr,
     ],
 )
@@ -350,9 +347,15 @@ def test_no_name_forges_a_line_of_the_log_of_a_recording(
     check_logged(caplog, 2)
 
     async def record_in_vain() -> None:
+        pipe = tmp_path / f"{NAMES[0]}.mcap"
+        os.mkfifo(pipe)
+        reading = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
         with Bus() as bus:
-            async with Recorder(bus, tmp_path / f"{NAMES[5]}.mcap") as recorder:
-                recorder._fail(OSError(NAMES[0]))
+            async with Recorder(bus, pipe, overwrite=True) as recorder:
+                os.close(reading)
+                bus.publish(moving("map", "base", 1))
+                await recorder.flush()
+            assert recorder.error is not None
             lines_of(repr(recorder))
 
     anyio.run(record_in_vain)
@@ -390,7 +393,7 @@ ON_DOMAIN = {
     "tree": ("tree",),
 }
 OF_BOTH = {"play": ("play", 0, "--rate", "inf"), "record": ("record", "NEW", "--duration", "0")}
-# What these print has only names that their user gives, and texts of errors.
+# These print only names that their user gives, and texts of errors.
 OWN = {"bridge", "broadcast", "demo", "foxglove", "listen", "router", "view"}
 
 
@@ -525,7 +528,7 @@ def test_html_has_every_name_as_a_printable_text(name: str) -> None:
 
 def htmls_with(name: str) -> Iterator[str]:
     tree = tree_with([name])
-    yield tree._repr_html_()
+    yield html_of(tree)
     pytest.importorskip("viser", reason="the live page needs viser")
     from tfbus.view.page import Page
 

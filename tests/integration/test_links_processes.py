@@ -1,15 +1,12 @@
-"""Buses in processes of their own, linked over the loopback or between network namespaces."""
+"""Buses in processes of their own, linked over the loopback; `tests/stress/test_links_faults.py` has hosts apart."""
 
-import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
+from contextlib import contextmanager
 from typing import Any
-from uuid import uuid4
 
 import pytest
 from start_together import measure
@@ -105,17 +102,6 @@ def test_a_ring_of_three_domains_brings_every_sample_once(processes: Crowd) -> N
     send_in_turn(members)
 
 
-def test_a_late_joiner_has_all_static_frames(processes: Crowd, place: Place) -> None:
-    names = [f"static{number}" for number in range(50)]
-    early = processes.add(place.first())
-    early.ask("statics", names=names, x=1.0)
-    early.ask("stream", authority="moving", batches=10, rate=1_000)
-    late = processes.add(place.other(), backend="trio")
-    late.ask("until", static=names)
-    assert late.ask("lookup", target="map", source="static49")["x"] == 1.0
-    assert late.ask("facts")["moving"] == []
-
-
 def test_processes_may_start_in_any_order(processes: Crowd, place: Place) -> None:
     late = processes.add(place.other())
     late.ask("statics", names=["before"])
@@ -201,19 +187,6 @@ def test_a_process_that_is_held_up_for_a_part_of_its_lease_is_not_lost(processes
     held_up.ask("statics", names=["camera"])
     listener.ask("until", static=["lidar", "camera"], peers=1)
     assert not listener.said(event="PeerLost")
-
-
-def test_a_process_that_stands_still_for_a_moment_misses_nothing(processes: Crowd, place: Place) -> None:
-    # The sockets take some 250 KB of some 500; with less still, TCP itself stands still.
-    config = {"transport/link/tcp/so_sndbuf": 2**16, "transport/link/tcp/so_rcvbuf": 2**16}
-    here = processes.add(place.first(config=config))
-    there = processes.add(place.other(config=config))
-    meet(here, there)
-    there.signal(signal.SIGSTOP)
-    here.ask("stream", authority="burst", batches=190, rate=1_000)
-    there.signal(signal.SIGCONT)
-    there.ask("until", last={"burst": 189})
-    assert there.ask("facts")["tallies"]["burst"]["batches"] == 190
 
 
 def test_a_slow_and_a_frozen_process_delay_no_other(processes: Crowd, place: Place) -> None:
@@ -323,215 +296,78 @@ def test_a_static_frame_that_comes_and_goes_is_there_at_last(processes: Crowd, p
         process.ask("until", x={"lidar": 1_000.0})
 
 
-# Event loops and programs that end without the end of their link, while messages keep coming.
+# Programs that end without the end of their link, while messages keep coming.
+BEGIN = """
+import asyncio, gc, sys, time
+import anyio
+from tfbus import Bus
+from tfbus.links.zenoh import ZenohLink
+
+# The broadcaster's stamps are of another time.
+bus = Bus(max_behind=None)
+link = ZenohLink(bus, DOMAIN, connect=ADDRESS)
+
+async def main():
+    heard = asyncio.Event()
+    bus.subscribe(lambda batch: heard.set())
+    await link.__aenter__()
+    await heard.wait()
+
+async def listen():
+    with bus.stream() as batches:
+        async with link:
+            async for batch in batches:
+                print("ready", flush=True)
+
+loop = asyncio.new_event_loop()
+"""
+CRASH = "loop.run_until_complete(main())\nprint('crash', flush=True)\n"
 CRASHES = {
     "the loop is closed": "loop.close(); time.sleep(0.1)",
     "the loop is left": "",
     "the link is forgotten": "loop.close(); del link; gc.collect()",
     "the program exits": "sys.exit(0)",
 }
+LISTEN = """
+try:
+    anyio.run(listen, backend=BACKEND)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+@contextmanager
+def program_beside(processes: Crowd, place: Place, text: str, **names: str) -> Iterator[subprocess.Popen[str]]:
+    """A program with a link, to which another process sends all the time, and which that loses in the end."""
+    broadcaster = processes.add(place.first())
+    broadcaster.start("stream", authority="wheels", batches=1_000_000, rate=1_000, size=5)
+    for name, value in (names | {"DOMAIN": place.domain, "ADDRESS": place.addresses[0]}).items():
+        text = text.replace(name, repr(value))
+    with subprocess.Popen(
+        [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+    broadcaster.wait(event="PeerLost")
 
 
 @pytest.mark.parametrize("end", CRASHES.values(), ids=CRASHES.keys())
 def test_a_link_that_was_never_ended_does_not_keep_the_program(end: str, processes: Crowd, place: Place) -> None:
-    broadcaster = processes.add(place.first())
-    broadcaster.start("stream", authority="wheels", batches=1_000_000, rate=2_000, size=5)
-    program = f"""
-import asyncio, gc, sys, time
-from tfbus import Bus
-from tfbus.links.zenoh import ZenohLink
-
-async def main():
-    bus, heard = Bus(), asyncio.Event()
-    bus.subscribe(lambda batch: heard.set())
-    link = ZenohLink(bus, {place.domain!r}, connect={place.addresses[0]!r})
-    await link.__aenter__()
-    await heard.wait()
-    return link
-
-loop = asyncio.new_event_loop()
-link = loop.run_until_complete(main())
-print("crash", flush=True)
-{end}
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False
-    )
-    assert (done.returncode, done.stdout) == (0, "crash\n"), done.stderr
-    broadcaster.wait(event="PeerLost")
+    with program_beside(processes, place, BEGIN + CRASH + end) as program:
+        assert (*program.communicate(timeout=PATIENCE), program.returncode) == ("crash\n", "", 0)
 
 
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 def test_ctrl_c_ends_a_program_with_a_link(backend: str, processes: Crowd, place: Place) -> None:
-    broadcaster = processes.add(place.first())
-    broadcaster.start("stream", authority="wheels", batches=1_000_000, rate=1_000, size=5)
-    program = f"""
-import anyio
-from tfbus import Bus
-from tfbus.links.zenoh import ZenohLink
-
-async def main():
-    # The broadcaster's stamps are of another time.
-    with Bus(max_behind=None) as bus, bus.stream() as batches:
-        async with ZenohLink(bus, {place.domain!r}, connect={place.addresses[0]!r}):
-            async for batch in batches:
-                print("ready", flush=True)
-
-try:
-    anyio.run(main, backend={backend!r})
-except KeyboardInterrupt:
-    print("interrupted")
-"""
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-        process.send_signal(signal.SIGINT)
-        try:
-            output, errors = process.communicate(timeout=PATIENCE)
-        finally:
-            process.kill()
-    assert (output.splitlines()[-1], errors, process.returncode) == ("interrupted", "", 0)
-    broadcaster.wait(event="PeerLost")
-
-
-Hosts = list[tuple[str, tuple[str, ...]]]
-
-
-@pytest.fixture
-def hosts() -> Iterator[Hosts]:
-    """Three hosts on one network: the address of each, and the prefix of a command that runs there."""
-    ip = shutil.which("ip")
-    if ip is None or os.geteuid() != 0:
-        pytest.skip("network namespaces need root and the program ip")
-    tag = uuid4().hex[:6]
-    names = [f"tf{tag}{letter}" for letter in "abc"]
-    switch = f"tf{tag}s"
-
-    def call(*arguments: str) -> None:
-        done = subprocess.run([ip, *arguments], capture_output=True, text=True, timeout=PATIENCE, check=False)
-        if done.returncode:
-            pytest.skip(f"no network namespaces here: {done.stderr.strip()}")
-
-    try:
-        for name in (switch, *names):
-            call("netns", "add", name)
-        call("-n", switch, "link", "add", "bridge", "type", "bridge")
-        call("-n", switch, "link", "set", "bridge", "up")
-        found: Hosts = []
-        for number, name in enumerate(names, 1):
-            call("-n", switch, "link", "add", name, "type", "veth", "peer", "eth0", "netns", name)
-            call("-n", switch, "link", "set", name, "master", "bridge", "up")
-            call("-n", name, "address", "add", f"10.98.76.{number}/24", "dev", "eth0")
-            call("-n", name, "link", "set", "eth0", "up")
-            call("-n", name, "link", "set", "lo", "up")
-            found.append((f"10.98.76.{number}", (ip, "netns", "exec", name)))
-        yield found
-    finally:
-        for name in (switch, *names):
-            subprocess.run([ip, "netns", "delete", name], capture_output=True, timeout=PATIENCE, check=False)
-
-
-def test_hosts_find_each_other_through_one_whose_address_they_know(hosts: Hosts, processes: Crowd) -> None:
-    domain = new_domain()
-    known = f"tcp/{hosts[0][0]}:17447"
-    members = [
-        processes.begin(
-            # Each listens at its own address, so the other two need the first one only to find each other.
-            {"domain": domain, "listen": known if number == 0 else f"tcp/{address}:0", "connect": [known][:number]},
-            prefix=prefix,
-            backend=BACKENDS[number],
-        )
-        for number, (address, prefix) in enumerate(hosts)
-    ]
-    meet(*members)
-    members[1].ask("statics", names=["lidar"])
-    members[2].ask("stream", authority="wheels", batches=100, rate=1_000)
-    for member in members:
-        member.ask("until", static=["lidar"], last={"wheels": 99})
-    members[0].kill()
-    members[1].wait(event="PeerLost")
-    members[1].ask("statics", names=["camera"])
-    members[2].ask("until", static=["camera"])
-
-
-def test_a_host_that_is_cut_off_is_lost_and_comes_back(hosts: Hosts, processes: Crowd) -> None:
-    (address, first), (_, second), _ = hosts
-    place = {"domain": new_domain(), "lease": 1.0, "drop_lost": True}
-    stays = processes.add({**place, "listen": f"tcp/{address}:17447"}, prefix=first)
-    apart = processes.add({**place, "connect": f"tcp/{address}:17447"}, prefix=second, backend="trio")
-    meet(stays, apart)
-    stays.ask("statics", names=["map lidar"])
-    apart.ask("statics", names=["lidar"], authority="urdf")
-    stays.ask("until", static=["lidar"])
-    apart.ask("until", static=["map lidar"])
-    subprocess.run([*second, "ip", "link", "set", "eth0", "down"], check=True, timeout=PATIENCE)
-    assert stays.wait(event="PeerLost")["authorities"] == ["urdf"]
-    apart.wait(event="PeerLost")
-    stays.ask("until", lacks=["lidar"])
-    apart.ask("until", lacks=["map lidar"])
-    apart.ask("statics", names=["meanwhile"])
-    subprocess.run([*second, "ip", "link", "set", "eth0", "up"], check=True, timeout=PATIENCE)
-    stays.ask("until", static=["lidar", "meanwhile"])
-    apart.ask("until", static=["map lidar"])
-
-
-def test_two_that_lose_each_other_while_both_hear_a_third_are_together_again(hosts: Hosts, processes: Crowd) -> None:
-    domain, known = new_domain(), f"tcp/{hosts[0][0]}:17447"
-    members = [
-        processes.begin(
-            {
-                "domain": domain,
-                "listen": known if number == 0 else f"tcp/{address}:17448",
-                "connect": [known][:number],
-                "lease": 1.0,
-                "drop_lost": True,
-            },
-            prefix=prefix,
-            backend=BACKENDS[number],
-        )
-        for number, (address, prefix) in enumerate(hosts)
-    ]
-    meet(*members)
-    _, one, other = members
-    one.ask("statics", names=["lidar"])
-    other.ask("until", static=["lidar"])
-    for change in ("add", "delete"):
-        for (_, prefix), (address, _) in ((hosts[1], hosts[2]), (hosts[2], hosts[1])):
-            route = ["ip", "route", change, "blackhole", f"{address}/32"]
-            subprocess.run([*prefix, *route], check=True, timeout=PATIENCE)
-        if change == "add":
-            other.ask("until", lacks=["lidar"], peers=1)
-            one.ask("until", peers=1)
-            one.ask("statics", names=["camera"])
-            # The third one hears both all the while.
-            members[0].ask("until", static=["lidar", "camera"], peers=2)
-    meet(*members)
-    other.ask("until", static=["lidar", "camera"])
-    one.ask("stream", authority="wheels", batches=10, rate=100.0)
-    other.ask("until", last={"wheels": 9})
-    assert other.ask("facts")["tallies"]["wheels"]["missing"] == 0
+    with program_beside(processes, place, BEGIN + LISTEN, BACKEND=backend) as program:
+        assert program.stdout is not None
+        assert program.stdout.readline() == "ready\n"
+        program.send_signal(signal.SIGINT)
+        output, errors = program.communicate(timeout=PATIENCE)
+    assert (output.splitlines()[-1], errors, program.returncode) == ("interrupted", "", 0)
 
 
 def test_processes_that_start_together_all_have_every_static_frame() -> None:
     assert max(measure(processes=8)) < PATIENCE
-
-
-def test_hosts_without_an_address_hear_only_themselves(hosts: Hosts, processes: Crowd) -> None:
-    domain = {"domain": new_domain()}
-    (_, first), (_, second), _ = hosts
-    apart, one, two = (processes.add(domain, prefix=prefix) for prefix in (first, second, second))
-    meet(one, two)
-    apart.ask("statics", names=["apart"])
-    one.ask("statics", names=["together"])
-    two.ask("until", static=["together"])
-    assert two.ask("facts")["static"] == ["together"]
-    assert apart.ask("facts")["links"][0]["peers"] == 0
-
-
-def test_a_process_that_fails_to_start_shows_its_error(processes: Crowd) -> None:
-    broken = processes.begin({"domain": "not a domain"})
-    with pytest.raises(EOFError, match="not a domain"):
-        broken.wait(event="ready")
-    assert Path(f"/proc/{broken.pid}").exists()

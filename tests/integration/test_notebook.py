@@ -12,7 +12,7 @@ from support.recorded import SMALL
 
 pytestmark = [
     pytest.mark.thorough,
-    # What the packages of Jupyter warn of is not about tfbus.
+    # The packages of Jupyter warn of things that are not about tfbus.
     pytest.mark.filterwarnings("ignore"),
 ]
 

@@ -13,7 +13,6 @@ import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, asynccontextmanager, contextmanager
 from pathlib import Path
-from typing import Any
 
 import anyio
 import pytest
@@ -29,7 +28,6 @@ from support.both_sides import (
     node,
 )
 from support.processes import free_ports, until
-from support.samples import static
 from support.wires import latched
 
 from tfbus import Buffer, Bus
@@ -101,46 +99,6 @@ async def answering(url: str) -> None:
                 await anyio.sleep(0.2)
 
 
-async def test_dds_both_ways_with_every_answer_right() -> None:
-    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
-    from tfbus.links.dds import DdsLink
-
-    domain = next(_next_domain)
-    with Bus() as bus:
-        assert await meet(DdsLink(bus, domain), bus, peer(domain)) == {"/driver"}
-
-
-async def test_dds_with_a_node_of_cyclone_dds_both_ways_with_every_answer_right() -> None:
-    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
-    from tfbus.links.dds import DdsLink
-
-    domain = next(_next_domain)
-    with Bus() as bus:
-        assert await meet(DdsLink(bus, domain), bus, cyclone_peer(domain)) == {"/cyclone"}
-
-
-async def test_dds_with_nodes_of_both_kinds_both_ways_with_every_answer_right() -> None:
-    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
-    from tfbus.links.dds import DdsLink
-
-    domain = next(_next_domain)
-    with Bus() as bus:
-        # Both move the same frame in the same way.
-        nodes = cyclone_peer(domain), peer(domain)
-        assert await meet(DdsLink(bus, domain), bus, *nodes) == {"/cyclone", "/driver"}
-
-
-async def test_rosbridge_both_ways_with_every_answer_right() -> None:
-    pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
-    from tfbus.links.rosbridge import RosbridgeLink
-
-    domain = next(_next_domain)
-    ros2_python()
-    with rosbridge(domain) as url, Bus() as bus:
-        await answering(url)
-        assert await meet(RosbridgeLink(bus, url), bus, peer(domain)) == {"rosbridge"}
-
-
 @contextmanager
 def robot(domain: int, folder: Path) -> Iterator[None]:
     """A robot in ROS, described and moving."""
@@ -157,45 +115,13 @@ def robot(domain: int, folder: Path) -> Iterator[None]:
         process.communicate()
 
 
-async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed_over_dds(tmp_path: Path) -> None:
-    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
-    pytest.importorskip("urdf_parser_py", reason='pip install "tfbus[urdf]"')
-    from tfbus.links.dds import DdsLink
-
-    domain = next(_next_domain)
-
-    def link(bus: Bus, **options: Any) -> RosLink:
-        return DdsLink(bus, domain, **options)
-
-    with robot(domain, tmp_path):
-        await check_clock(link)
-        await check_description_and_joints(link)
-        await check_command(link, f"dds:{domain}")
-
-
-async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed_through_rosbridge(tmp_path: Path) -> None:
-    pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
-    pytest.importorskip("urdf_parser_py", reason='pip install "tfbus[urdf]"')
-    from tfbus.links.rosbridge import RosbridgeLink
-
-    domain = next(_next_domain)
-    with robot(domain, tmp_path), rosbridge(domain) as url:
-        await answering(url)
-
-        def link(bus: Bus, **options: Any) -> RosLink:
-            return RosbridgeLink(bus, url, **options)
-
-        await check_clock(link)
-        await check_description_and_joints(link)
-        await check_command(link, url)
-
-
+MakeLink = Callable[..., RosLink]
 MakePeer = Callable[..., AbstractContextManager[Node]]
 
 
 @asynccontextmanager
-async def links(kind: str, domain: int) -> AsyncIterator[tuple[Callable[[Bus], RosLink], MakePeer]]:
-    """Makes links to ROS 2, and nodes of it; skips the test without them."""
+async def links(kind: str, domain: int) -> AsyncIterator[tuple[MakeLink, MakePeer, str]]:
+    """Makes links to ROS 2, and nodes of it; with the place that a command calls it by. Skips the test without them."""
     if kind != "cyclone":
         ros2_python()
     if kind == "rosbridge":
@@ -204,21 +130,51 @@ async def links(kind: str, domain: int) -> AsyncIterator[tuple[Callable[[Bus], R
 
         with rosbridge(domain) as url:
             await answering(url)
-            yield lambda bus: RosbridgeLink(bus, url), peer
+            yield lambda bus, **options: RosbridgeLink(bus, url, **options), peer, url
     else:
         pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
         from tfbus.links.dds import DdsLink
 
-        yield lambda bus: DdsLink(bus, domain), cyclone_peer if kind == "cyclone" else peer
+        make_peer = cyclone_peer if kind == "cyclone" else peer
+        yield lambda bus, **options: DdsLink(bus, domain, **options), make_peer, f"dds:{domain}"
 
 
-KINDS = ["dds", "cyclone", "rosbridge"]
+KINDS = {"dds": "/driver", "cyclone": "/cyclone", "rosbridge": "rosbridge"}
+"""The name of the authority behind each."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_both_ways_with_every_answer_right(kind: str) -> None:
+    domain = next(_next_domain)
+    async with links(kind, domain) as (link_of, peer_of, _):
+        with Bus() as bus:
+            assert await meet(link_of(bus), bus, peer_of(domain)) == {KINDS[kind]}
+
+
+async def test_dds_with_nodes_of_both_kinds_both_ways_with_every_answer_right() -> None:
+    domain = next(_next_domain)
+    async with links("dds", domain) as (link_of, peer_of, _):
+        with Bus() as bus:
+            # Both move the same frame in the same way.
+            nodes = cyclone_peer(domain), peer_of(domain)
+            assert await meet(link_of(bus), bus, *nodes) == {"/cyclone", "/driver"}
+
+
+@pytest.mark.parametrize("kind", ["dds", "rosbridge"])
+async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed(kind: str, tmp_path: Path) -> None:
+    pytest.importorskip("urdf_parser_py", reason='pip install "tfbus[urdf]"')
+    domain = next(_next_domain)
+    async with links(kind, domain) as (link_of, _, place):
+        with robot(domain, tmp_path):
+            await check_clock(link_of)
+            await check_description_and_joints(link_of)
+            await check_command(link_of, place)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_node_that_is_killed_is_heard_again_when_it_is_back(kind: str) -> None:
     domain = next(_next_domain)
-    async with links(kind, domain) as (link_of, peer_of):
+    async with links(kind, domain) as (link_of, peer_of, _):
         with Bus() as bus, Buffer(bus) as buffer:
             async with link_of(bus) as link:
                 with peer_of(domain, 60.0):
@@ -233,7 +189,7 @@ async def test_a_node_that_is_killed_is_heard_again_when_it_is_back(kind: str) -
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(kind: str) -> None:
     domain = next(_next_domain)
-    async with links(kind, domain) as (link_of, peer_of):
+    async with links(kind, domain) as (link_of, peer_of, _):
         with peer_of(domain, 8.0) as ros, Bus() as bus, Buffer(bus) as buffer:
             assert (await ros.next_line())["event"] == "up"
             program = Program(bus, buffer)
@@ -251,7 +207,7 @@ async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(kind: str
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_late_link_has_the_static_frames_of_ros_and_of_other_links(kind: str) -> None:
     domain = next(_next_domain)
-    async with links(kind, domain) as (link_of, peer_of):
+    async with links(kind, domain) as (link_of, peer_of, _):
         with peer_of(domain, 60.0), Bus() as bus, Buffer(bus) as buffer:
             Program(bus, buffer)
             async with link_of(bus):
@@ -260,59 +216,6 @@ async def test_a_late_link_has_the_static_frames_of_ros_and_of_other_links(kind:
                     async with link_of(late_bus):
                         await late.lookup("base", "laser", timeout=40.0)
                         await late.lookup("arm", "tool", timeout=40.0)
-
-
-async def test_a_link_to_rosbridge_whose_connection_broke_hears_moving_frames_again_and_is_heard() -> None:
-    domain = next(_next_domain)
-    async with links("rosbridge", domain) as (link_of, peer_of):
-        with Bus() as bus, Buffer(bus) as buffer:
-            program = Program(bus, buffer)
-            async with link_of(bus) as link, anyio.create_task_group() as tasks:
-                tasks.start_soon(program.send)
-                with peer_of(domain, 25.0) as ros:
-                    assert (await ros.next_line())["event"] == "up"
-                    await buffer.lookup("odom", "tool", timeout=20.0)
-                    # The server still has our publisher, beside which it subscribes to what is latched only.
-                    await link._carrier._socket.close()  # type: ignore[attr-defined]
-                    await until(lambda: link.peers == ())
-                    await until(lambda: link.peers != ())
-                    # What it had before the break is too old by then.
-                    await anyio.sleep(2.0)
-                    await buffer.lookup("odom", "tool", max_age=1.0, timeout=40.0)
-                    facts = await ros.next_line()
-                tasks.cancel_scope.cancel()
-    # Some 11 s of 25 are lost for moving frames.
-    assert facts["received"]["arm"] > 900
-    assert facts["wrong"] == 0
-
-
-async def test_a_static_frame_that_a_rosbridge_refuses_at_first_arrives_in_the_end(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    domain = next(_next_domain)
-    lidar = static("map", "lidar", 2.0, stamp=5)
-    async with links("rosbridge", domain) as (link_of, peer_of):
-        with peer_of(domain, 60.0):
-            for _ in range(2):
-                # A client that listens, and is gone without a word while it is written to: then the server logs a
-                # warning, after which its logger refuses those of the next advertise, and with them that.
-                with Bus() as bus, Buffer(bus) as buffer:
-                    async with link_of(bus) as link:
-                        await buffer.lookup("odom", "base", timeout=20.0)
-                        stream = link._carrier._socket._stream  # type: ignore[attr-defined]
-                        await anyio.aclose_forcefully(stream)
-                        await until(lambda: link.peers == ())
-            with Bus() as bus:
-                bus.publish(lidar)
-                async with link_of(bus) as link:
-                    await until(lambda: link.statistics().duplicates > 0)
-                    refused = link.statistics().not_sent.get("not confirmed", 0)
-                    said = [record.getMessage() for record in caplog.records if "given back" in record.getMessage()]
-                    assert len(said) == refused
-                    with Bus() as late, Buffer(late) as buffer:
-                        async with link_of(late):
-                            found = await buffer.lookup("map", "lidar", timeout=20.0)
-    assert found.transform.is_close(lidar.transform)
 
 
 def test_messages_of_rclpy_become_data_and_messages_again() -> None:

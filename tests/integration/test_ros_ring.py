@@ -71,7 +71,7 @@ async def test_a_ring_of_rosbridge_dds_and_zenoh_hears_each_sample_once(domain_n
         await until(lambda: all("lidar" in latched(bus) for bus in (*buses, ros2)))
         everything = Counter({(child, stamp): 1 for child in CHILDREN for stamp in range(STAMPS)})
         await until(lambda: all(counter.total() >= everything.total() for counter in heard))
-        # What goes round comes before one that is sent now has gone round.
+        # A sample that still goes round arrives before one that is sent now has gone round.
         for stamp in range(STAMPS, STAMPS + 5):
             first.publish(moving("map", "first", stamp))
             everything["first", stamp] = 1

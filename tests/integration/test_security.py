@@ -1,4 +1,4 @@
-"""The guide's page *Security*: each of its statements names the test that holds it; here are those that had none."""
+"""The guide's page *Security*: each of its statements names the test that holds it; the tests here hold the rest."""
 
 import inspect
 import re
@@ -52,7 +52,7 @@ def sockets() -> set[str]:
     """The sockets of this process that others can send to: kind and address."""
     own = set()
     for entry in Path("/proc/self/fd").iterdir():
-        # That of this list is gone.
+        # The descriptor that read this list is closed by now.
         with suppress(FileNotFoundError):
             own.add(str(entry.readlink()))
     found = set()

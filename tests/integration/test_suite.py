@@ -84,23 +84,15 @@ def run(folder: Path, **files: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_a_test_that_hangs_fails_and_the_next_ones_run(tmp_path: Path) -> None:
-    lines = run(tmp_path, test_hanging=HANGING)
-    for name in ("test_that_sleeps", "test_that_spins"):
-        assert f"FAILED test_hanging.py::{name} - Failed: it has not ended within 1 s" in lines
-    assert "PASSED test_hanging.py::test_that_ends" in lines
-
-
-def test_a_process_that_a_test_has_left_is_killed_with_its_file(tmp_path: Path) -> None:
-    lines = run(tmp_path, test_a_leaving=LEAVING, test_b_after_it=AFTER_IT)
+def test_a_suite_ends_in_time_leaves_no_process_and_skips_what_needs_an_absent_extra(tmp_path: Path) -> None:
+    texts = {"test_a_leaving": LEAVING, "test_b_after_it": AFTER_IT, "test_hanging": HANGING, "test_needy": NEEDY}
+    lines = run(tmp_path, **texts, test_file="import package_of_an_extra\n")
     assert "PASSED test_b_after_it.py::test_that_it_has_been_killed" in lines, "\n".join(lines)
-
-
-def test_what_needs_an_absent_extra_is_skipped_with_its_name(tmp_path: Path) -> None:
-    lines = run(tmp_path, test_needy=NEEDY, test_file="import package_of_an_extra\n")
+    assert "PASSED test_hanging.py::test_that_ends" in lines
     skipped = [line for line in lines if line.startswith("SKIPPED")]
     assert sum(int(line.partition("[")[2].partition("]")[0]) for line in skipped) == 4
     assert all(line.endswith(": the extra fancy is not installed") for line in skipped)
-    failed = [line for line in lines if line.startswith("FAILED")]
-    assert len(failed) == 1
-    assert "test_that_needs_another_package" in failed[0]
+    slept, spun, needs = sorted(line for line in lines if line.startswith("FAILED"))
+    assert slept == "FAILED test_hanging.py::test_that_sleeps - Failed: it has not ended within 1 s"
+    assert spun == "FAILED test_hanging.py::test_that_spins - Failed: it has not ended within 1 s"
+    assert "test_that_needs_another_package" in needs

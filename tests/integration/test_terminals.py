@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from support import pr2
+from support.commands import lines_on_a_terminal
 from support.processes import free_address, new_domain, start_tfbus
 from support.recorded import SMALL
-from support.terminal import lines_on_a_terminal
 
 from tfbus.cli.output import cells
 

@@ -1,4 +1,4 @@
-""""""
+"""The values that are drawn: series, lines of text, and arrivals."""
 
 import numpy as np
 import pytest

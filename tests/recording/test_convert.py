@@ -8,7 +8,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import zstandard
 from hypothesis import given
@@ -27,24 +26,24 @@ from tfbus.recording import Conversion, Edits, convert, load, open_recording
 from tfbus.recording.formats.copies import (
     BagCopy,
     CannotWriteError,
+    Copy,
     FoxgloveCopy,
     McapCopy,
     MessageTypes,
     SqliteCopy,
-    foxglove_channel,
-    write_protobuf,
 )
 from tfbus.recording.formats.mcap_output import TYPE_HASH
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.formats.transforms import RawTransform, parser_of, write_cdr, write_ros1
 from tfbus.recording.recording import open_storage
-from tfbus.tf_message import MalformedMessageError, encode
+from tfbus.tf_message import encode
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 TF = "tf2_msgs/msg/TFMessage"
 ENDINGS = (".mcap", ".bag", ".db3")
 CDR, ROS1 = Channel("/tf", TF, "cdr"), Channel("/tf", "tf2_msgs/TFMessage", "ros1")
 
+HELLO = bytes(TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String"))
 LINES: list[Line] = [
     (10, "/tf_static", [static("base", "laser", 1.0), static("base", "camera", 2.0)]),
     *((100 + k, "/tf", [moving("odom", "base", k, float(k)), moving("base", "wheel", k)]) for k in range(20)),
@@ -52,22 +51,14 @@ LINES: list[Line] = [
 EXPECTED = [(received, tuple(samples)) for received, _, samples in LINES]
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "run.mcap"
-
-
 def raw(path: Path) -> list[tuple[int, str, list[RawTransform]]]:
     """Log time, topic and the transforms of all messages, bit by bit."""
-    storage = open_storage(path)
-    try:
+    with closing(open_storage(path)) as storage:
         return [
             (received, channel.topic, parser_of(channel)(payload))
             for received, channel, payload in storage.messages(lambda channel: channel.topic in ("/tf", "/tf_static"))
             if isinstance(channel, Channel)
         ]
-    finally:
-        storage.close()
 
 
 @pytest.mark.parametrize("first", ENDINGS)
@@ -143,15 +134,14 @@ def test_a_bag_made_of_cdr_describes_its_types_as_ros_1_does(tmp_path: Path) -> 
 def test_other_topics_pass_through_untouched_or_are_converted_where_the_format_needs_it(
     tmp_path: Path, path: Path
 ) -> None:
-    text = bytes(TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String"))
-    source = write_mcap(path, [(5, "/said", text)], schema="std_msgs/msg/String")
+    source = write_mcap(path, [(5, "/said", HELLO)], schema="std_msgs/msg/String")
     bag, back = tmp_path / "run.bag", tmp_path / "back.db3"
     convert([source], tmp_path / "same.mcap")
-    assert lines_of_others(tmp_path / "same.mcap") == [("/said", 5, text)]
+    assert lines_of_others(tmp_path / "same.mcap") == [("/said", 5, HELLO)]
     convert([source], bag)
     assert lines_of_others(bag) == [("/said", 5, b"\5\0\0\0hello")]
     convert([bag], back)
-    assert lines_of_others(back) == [("/said", 5, text)]
+    assert lines_of_others(back) == [("/said", 5, HELLO)]
 
 
 def test_what_a_format_cannot_hold_is_left_out_and_counted(tmp_path: Path, path: Path) -> None:
@@ -171,20 +161,19 @@ def test_what_a_format_cannot_hold_is_left_out_and_counted(tmp_path: Path, path:
 
 
 def test_what_the_recorder_has_compressed_is_unfolded_and_what_only_looks_like_it_is_not(tmp_path: Path) -> None:
-    text = bytes(TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String"))
-    folded = zstandard.compress(text)
+    folded = zstandard.compress(HELLO)
     torn = folded[:4] + b"\xff" * 30
-    lines: list[Line] = [(1, "/said", folded), (2, "/said", torn), (3, "/said", text)]
+    lines: list[Line] = [(1, "/said", folded), (2, "/said", torn), (3, "/said", HELLO)]
     source = write_mcap(tmp_path / "run.mcap", lines, schema="std_msgs/msg/String")
     path = tmp_path / "copy.mcap"
     done = convert([source], path)
-    assert lines_of_others(path) == [("/said", 1, text), ("/said", 3, text)]
+    assert lines_of_others(path) == [("/said", 1, HELLO), ("/said", 3, HELLO)]
     assert (done.messages, done.problems) == (2, {"damaged": 1})
     assert "cannot be decompressed" in done.details[0]
     # In another encoding, these may be the first bytes of anything.
     source = write_mcap(tmp_path / "other.mcap", lines, schema="my.Thing", encoding="protobuf")
     assert convert([source], path, overwrite=True).problems == {}
-    assert [payload for _, _, payload in lines_of_others(path)] == [folded, torn, text]
+    assert [payload for _, _, payload in lines_of_others(path)] == [folded, torn, HELLO]
 
 
 def test_runs_of_authorities_keep_their_lengths_and_a_single_one_stands_for_any_number(tmp_path: Path) -> None:
@@ -251,14 +240,6 @@ def test_static_transforms_are_left_out_and_told(tmp_path: Path, source: Path) -
     }
 
 
-def test_a_part_begins_with_the_static_transforms_from_before(tmp_path: Path, source: Path) -> None:
-    _, found = edited(tmp_path, source, since=105, until=107)
-    assert [received for received, _ in found] == [105, 105, 106, 107]
-    assert [each.child for each in found[0][1]] == ["laser", "camera"]
-    _, found = edited(tmp_path, source, topics=["tf"])
-    assert [received for received, _ in found] == [100 + k for k in range(20)]
-
-
 def test_static_transforms_from_before_a_part_come_once_each_in_the_order_in_which_they_came_last(
     tmp_path: Path, path: Path
 ) -> None:
@@ -272,6 +253,11 @@ def test_static_transforms_from_before_a_part_come_once_each_in_the_order_in_whi
     ):
         _, found = edited(tmp_path, source, since=since)
         assert found == expected
+
+
+def test_a_part_includes_both_ends_and_has_the_chosen_topics(tmp_path: Path, source: Path) -> None:
+    _, found = edited(tmp_path, source, since=105, until=107, topics=["tf"])
+    assert [received for received, _ in found] == [105, 106, 107]
 
 
 def test_several_recordings_are_merged_by_their_log_times(tmp_path: Path) -> None:
@@ -325,6 +311,13 @@ def test_foxglove_transforms_become_those_of_ros(tmp_path: Path, path: Path) -> 
         assert [topic.type for topic in recording.topics] == ["foxglove.FrameTransforms"]
 
 
+def raw_of(found: Any) -> RawTransform:
+    """A decoded transform of Foxglove's."""
+    numbers = [getattr(found.translation, axis) for axis in "xyz"] + [getattr(found.rotation, axis) for axis in "xyzw"]
+    names = found.parent_frame_id.encode(), found.child_frame_id.encode()
+    return RawTransform(found.timestamp.seconds, found.timestamp.nanos, *names, struct.pack("<7d", *numbers))
+
+
 def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: Path, path: Path) -> None:
     done = convert([SMALL], path, schema="foxglove")
     assert done.problems == {}
@@ -337,19 +330,9 @@ def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: P
     from mcap_protobuf.decoder import DecoderFactory
 
     with path.open("rb") as file:
-        decoded = [
-            message for *_, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
-        ]
-    for (_, _, transforms), message in zip(raw(SMALL), decoded, strict=True):
-        assert [(each.parent_frame_id.encode(), each.child_frame_id.encode()) for each in message.transforms] == [
-            (each.parent, each.child) for each in transforms
-        ]
-        for each, found in zip(transforms, message.transforms, strict=True):
-            numbers = [getattr(found.translation, axis) for axis in "xyz"] + [
-                getattr(found.rotation, axis) for axis in "xyzw"
-            ]
-            np.testing.assert_equal(numbers, struct.unpack("<7d", each.numbers))
-            assert (found.timestamp.seconds, found.timestamp.nanos) == (each.seconds, each.nanoseconds)
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        decoded = [list(map(raw_of, message.transforms)) for *_, message in reader.iter_decoded_messages()]
+    assert decoded == [transforms for _, _, transforms in raw(SMALL)]
     convert([path], tmp_path / "back.bag")
     assert raw(tmp_path / "back.bag") == raw(SMALL)
 
@@ -406,23 +389,22 @@ def test_names_are_compared_without_their_slashes() -> None:
     assert Edits(prefix="r/").apply(SLASHED)[2:4] == (b"r/odom", b"r/base")
     assert Edits(frames=["base"]).keeps(SLASHED)
     assert not Edits(frames=["odom"]).keeps(SLASHED)
+    # A name that is no text keeps its bytes.
+    assert Edits(prefix="r/").apply(RawTransform(1, 2, b"/odom", b"\xffbase", bytes(56))).child == b"r/\xffbase"
 
 
-def test_a_name_that_is_no_text_keeps_its_bytes() -> None:
-    broken = RawTransform(1, 2, b"/odom", b"\xffbase", bytes(56))
-    assert Edits(prefix="r/").apply(broken).child == b"r/\xffbase"
-
-
-TF_CHANNEL = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr")
 PAYLOAD = encode([moving("a", "b", 5)])
+
+
+def write_all(copy: Copy, *messages: tuple[Channel, int, bytes]) -> None:
+    for channel, received, payload in messages:
+        copy.write(channel, received, payload)
+    copy.finish()
 
 
 def test_a_copy_in_mcap_is_a_recording_of_ros_2(tmp_path: Path) -> None:
     path = tmp_path / "run"
-    copy = McapCopy(path, "run")
-    copy.write(Channel("/log", "", "json"), 5, b"{}")
-    copy.write(TF_CHANNEL, 6, PAYLOAD)
-    copy.finish()
+    write_all(McapCopy(path, "run"), (Channel("/log", "", "json"), 5, b"{}"), (CDR, 6, PAYLOAD))
     with path.open("rb") as file:
         reader = make_reader(file)
         assert [(entry.name, entry.metadata) for entry in reader.iter_metadata()] == [("rosbag2", {})]
@@ -439,9 +421,9 @@ def test_times_before_1970_are_refused_where_a_format_has_none(tmp_path: Path) -
     for kind in (McapCopy, BagCopy):
         copy = kind(tmp_path / "run", "run")
         with pytest.raises(CannotWriteError, match="no time before 1970"):
-            copy.write(TF_CHANNEL, -1, PAYLOAD)
+            copy.write(CDR, -1, PAYLOAD)
         # 1970 begins with 0.
-        copy.write(TF_CHANNEL, 0, PAYLOAD)
+        copy.write(CDR, 0, PAYLOAD)
         copy.close()
 
 
@@ -456,22 +438,18 @@ def test_without_the_extra_a_copy_in_foxglove_s_schema_makes_no_file(
 
 def test_the_definition_of_a_type_stays_where_it_is_one_of_ros_2(tmp_path: Path) -> None:
     path = tmp_path / "run.db3"
-    copy = SqliteCopy(path, "run.db3")
-    for kind, encoding in (("a/msg/A", "ros2msg"), ("b/msg/B", "ros2idl"), ("c/msg/C", "")):
-        copy.write(Channel(f"/{kind}", kind, "cdr", encoding, b"int8 x"), 1, b"")
-    copy.write(Channel("/tf", TF_CHANNEL.type, "cdr", "ros2msg", b"int8 y"), 1, b"")
-    copy.finish()
+    kinds = [("a/msg/A", "ros2msg"), ("b/msg/B", "ros2idl"), ("c/msg/C", ""), (TF, "ros2msg")]
+    channels = [Channel(f"/{kind}", kind, "cdr", encoding, b"int8 x") for kind, encoding in kinds]
+    write_all(SqliteCopy(path, "run.db3"), *((channel, 1, b"") for channel in channels))
     with closing(sqlite3.connect(path)) as file:
         found = file.execute("SELECT * FROM message_definitions ORDER BY id").fetchall()
-    assert found == [(1, "a/msg/A", "ros2msg", "int8 x", ""), (2, TF_CHANNEL.type, "ros2msg", "int8 y", TYPE_HASH)]
+    assert found == [(1, "a/msg/A", "ros2msg", "int8 x", ""), (2, CDR.type, "ros2msg", "int8 x", TYPE_HASH)]
 
 
 def test_a_bag_is_latching_where_transforms_are_static(tmp_path: Path) -> None:
     path = tmp_path / "run.bag"
-    copy = BagCopy(path, "run.bag")
-    for topic in ("/tf", "/tf_static"):
-        copy.write(Channel(topic, TF_CHANNEL.type, "cdr"), 1, PAYLOAD)
-    copy.finish()
+    topics = ("/tf", "/tf_static")
+    write_all(BagCopy(path, "run.bag"), *((Channel(topic, TF, "cdr"), 1, PAYLOAD) for topic in topics))
     with Reader(path) as bag:
         # As a publisher of ROS 1 says it: not at all, or 1.
         found = {each.topic: getattr(each.ext, "latching", "") for each in bag.connections}
@@ -485,10 +463,7 @@ def test_the_metadata_have_the_first_time_and_the_duration(
     tmp_path: Path, times: list[int], start: int, duration: int
 ) -> None:
     path = tmp_path / "run.db3"
-    copy = SqliteCopy(path, "run.db3")
-    for time in times:
-        copy.write(TF_CHANNEL, time, PAYLOAD)
-    copy.finish()
+    write_all(SqliteCopy(path, "run.db3"), *((CDR, time, PAYLOAD) for time in times))
     with closing(sqlite3.connect(path)) as file:
         ((text,),) = file.execute("SELECT metadata FROM metadata")
     metadata = json.loads(text)["rosbag2_bagfile_information"]
@@ -526,21 +501,3 @@ def test_the_definition_of_a_type_of_ros_2_has_the_digest_of_ros_1(kind: str, di
     assert found == digest
     # A header counts the messages there, which ROS 2 has given up.
     assert ("uint32 seq\ntime stamp\nstring frame_id\n" in definition) == (kind != "std_msgs/msg/String")
-
-
-CHANNEL = foxglove_channel(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"), {})
-
-numbers = st.lists(st.floats(), min_size=7, max_size=7).map(lambda values: struct.pack("<7d", *values))
-
-
-def test_the_seconds_that_a_stamp_of_foxglove_holds_are_written() -> None:
-    for seconds in (-(2**63), -1, 2**63 - 1):
-        edge = RawTransform(seconds, 0, b"map", b"base", bytes(56))
-        assert parser_of(CHANNEL)(write_protobuf([edge])) == [edge]
-    # A negative number has ten bytes, as one of 64 bits in two's complement.
-    before = RawTransform(-1, 0, b"map", b"base", bytes(56))
-    assert b"\x08" + b"\xff" * 9 + b"\x01\x10" in write_protobuf([before])
-    for seconds in (-(2**63) - 1, 2**63):
-        with pytest.raises(MalformedMessageError, match=f"{seconds} s does not fit the stamp") as raised:
-            write_protobuf([RawTransform(seconds, 0, b"map", b"base", bytes(56))])
-        assert raised.value.reason == "stamp"

@@ -20,11 +20,6 @@ ARM = RobotModel(
 )
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "run.mcap"
-
-
 def write(path: Path, *payloads: bytes, topic: str = "/joint_states", schema: str = KIND) -> Path:
     return write_mcap(path, [(at, topic, payload) for at, payload in enumerate(payloads)], schema=schema)
 

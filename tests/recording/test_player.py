@@ -17,6 +17,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.asking import Asked, settle
+from support.processes import is_open
 from support.recorded import SMALL, WRONG_IN_SMALL, batches_in, write_mcap
 from support.samples import moving, static
 from trio.testing import MockClock
@@ -51,12 +52,6 @@ AS_FAST_AS_POSSIBLE = math.inf
 START = 1_700_000_000 * SECOND
 
 
-@pytest.fixture
-def bus() -> Iterator[Bus]:
-    with Bus(SimulatedClock()) as bus:
-        yield bus
-
-
 def write_recording(path: Path, *entries: TimedBatch) -> Path:
     """A recording with batches at log times."""
     with closing(McapOutput(str(path), overwrite=True)) as output:
@@ -76,19 +71,18 @@ def x_at(buffer: Buffer, seconds: float) -> float:
 
 
 @contextmanager
-def reads_of(path: Path) -> Iterator[set[int]]:
-    """The threads that open a file."""
-    readers: set[int] = set()
+def before_opening(path: Path, call: Callable[[], object]) -> Iterator[None]:
+    """Call a function in each thread that is about to open a file."""
     listening = [True]
 
     def hear(event: str, arguments: tuple[object, ...]) -> None:
         if listening and event == "open" and arguments[0] in (path, str(path)):
-            readers.add(threading.get_ident())
+            call()
 
-    # It cannot be taken away again.
+    # No interface removes an audit hook.
     sys.addaudithook(hear)
     try:
-        yield readers
+        yield
     finally:
         listening.clear()
 
@@ -96,8 +90,9 @@ def reads_of(path: Path) -> Iterator[set[int]]:
 class Listener:
     """Collects the batches of a bus, with the clock's time."""
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: Bus, patience: float = PATIENCE) -> None:
         self.entries: list[TimedBatch] = []
+        self._patience = patience
         self._bus = bus
         self._registration = bus.subscribe(self._hear)
         self.arrived = anyio.Event()
@@ -111,7 +106,7 @@ class Listener:
         return [batch for _, batch in self.entries]
 
     async def until(self, count: int) -> None:
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(self._patience):
             while len(self.entries) < count:
                 self.arrived = anyio.Event()
                 await self.arrived.wait()
@@ -186,19 +181,26 @@ def test_timed_tasks_see_the_same_in_each_run(tmp_path: Path, backend: str, runs
     assert found == [[0.0, *((look - 1) // 2 / 100 for look in range(1, 1_199))]] * runs
 
 
-async def test_looping_jumps_back_and_drops_moving_samples(tmp_path: Path) -> None:
-    entries = drive((0.0, 1.0, 2.0))
+@pytest.mark.parametrize("simulated", [True, False])
+async def test_looping_forgets_the_moving_samples_of_the_last_pass_and_keeps_the_static_ones(
+    tmp_path: Path, simulated: bool
+) -> None:
+    # The buffer keeps ten seconds, so it would refuse the first sample behind those of the last pass.
+    entries = drive((0.0, 18.0, 19.0, 20.0))
     path = write_recording(tmp_path / "run.mcap", (START, (static("base", "rig", 5.0),)), *entries)
     found: list[object] = []
-    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer, bus.events(stale_after=None) as events:
+    with (
+        Bus(SimulatedClock() if simulated else None) as bus,
+        Buffer(bus) as buffer,
+        bus.events(stale_after=None) as events,
+    ):
 
         def ask(batch: Batch) -> None:
-            # Before the middle of each pass: what the end of the last one said must be gone, and the rig still there.
             if batch == entries[0][1]:
                 found.append(buffer.can_transform("map", "rig", START))
-                found.append(buffer.can_transform("map", "base", START + 2 * SECOND))
-            if batch == entries[2][1]:
-                found.append(x_at(buffer, 1.5))
+                found.append(buffer.can_transform("map", "base", START + 20 * SECOND))
+            if batch == entries[3][1]:
+                found.append(x_at(buffer, 19.5))
                 if player.passes == 2:
                     scope.cancel()
 
@@ -206,12 +208,14 @@ async def test_looping_jumps_back_and_drops_moving_samples(tmp_path: Path) -> No
         player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE, loop=True)
         with anyio.CancelScope() as scope, anyio.fail_after(PATIENCE):
             await player.play()
-        resets = bus.statistics().clock_resets
+        expired = sum(each.expired for each in bus.statistics().buffers)
         bus.close()
-        told = [(event.before, event.stamp) async for event in events if isinstance(event, ClockReset)]
-    assert found == [True, False, 1.5] * 3
-    assert resets == 2
-    assert told == [(START + 2 * SECOND, START)] * 2
+        told = [event async for event in events]
+    assert found == [True, False, 19.5] * 3
+    assert expired == 0
+    resets = [(event.before, event.stamp) for event in told if isinstance(event, ClockReset)]
+    removed = [event.frame for event in told if isinstance(event, FrameRemoved)]
+    assert (resets, removed) == (([(START + 20 * SECOND, START)] * 2, []) if simulated else ([], ["base"] * 2))
 
 
 async def test_a_task_that_waited_for_the_last_sample_runs_before_the_clock_jumps(tmp_path: Path) -> None:
@@ -233,31 +237,6 @@ async def test_a_task_that_waited_for_the_last_sample_runs_before_the_clock_jump
             playing.cancel_scope.cancel()
     assert last.answer == 1.0
     assert isinstance(never.error, ClockResetError)
-
-
-async def test_on_a_clock_that_cannot_jump_looping_removes_moving_frames(tmp_path: Path) -> None:
-    entries = drive((0.0, 100.0, 200.0))
-    path = write_recording(tmp_path / "run.mcap", (START, (static("base", "rig", 5.0),)), *entries)
-    with Bus() as bus, Buffer(bus) as buffer, bus.events(stale_after=None) as events:
-        found: list[object] = []
-
-        def ask(batch: Batch) -> None:
-            # Nothing so old would be taken behind the end of the last pass.
-            if batch == entries[0][1]:
-                found.append(buffer.can_transform("map", "rig", START))
-                if player.passes == 2:
-                    scope.cancel()
-
-        bus.subscribe(ask)
-        player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE, loop=True)
-        with anyio.CancelScope() as scope, anyio.fail_after(PATIENCE):
-            await player.play()
-        expired = sum(buffer.expired for buffer in bus.statistics().buffers)
-        bus.close()
-        removed = [event.frame async for event in events if isinstance(event, FrameRemoved)]
-    assert found == [True] * 3
-    assert removed == ["base"] * 2
-    assert expired == 0
 
 
 async def test_a_frame_that_another_sends_again_is_not_removed_with_those_that_were_played(tmp_path: Path) -> None:
@@ -313,34 +292,29 @@ async def test_a_range_begins_with_the_static_transforms_from_before(tmp_path: P
 
 
 @pytest.mark.parametrize("simulated", [True, False])
-async def test_a_seek_interrupts_a_pause_of_an_hour(tmp_path: Path, simulated: bool) -> None:
-    entries = [(START, (static("base", "rig"),)), *drive((0.0, 3_600.0, 7_200.0))]
-    path = write_recording(tmp_path / "run.mcap", *entries)
+async def test_a_seek_begins_with_the_static_transforms_and_only_one_back_is_an_event(
+    tmp_path: Path, simulated: bool
+) -> None:
+    rig, first, second, third = entries = [(START, (static("base", "rig"),)), *drive((0.0, 3_600.0, 7_200.0))]
+    seeks = {2: second[0], 4: first[0], 6: third[0]}
     with Bus(SimulatedClock() if simulated else None) as bus, bus.events(stale_after=None) as events:
         heard = Listener(bus)
-        player = Player(bus, path)
-        async with anyio.create_task_group() as tasks:
-            playing = Asked(tasks, player.play)
-            await heard.until(2)
-            player.seek(START + 3_600 * SECOND)
-            await heard.until(4)
-            assert not playing.ended
-            player.seek(START)
-            await heard.until(6)
-            player.seek(START + 7_200 * SECOND)
-            with anyio.fail_after(PATIENCE):
-                while not playing.ended:  # noqa: ASYNC110
-                    await anyio.sleep(0.001)
-        if simulated:
-            assert [now for now, _ in heard.entries] == [
-                START + hours * 3_600 * SECOND for hours in (0, 0, 1, 1, 0, 0, 2, 2)
-            ]
+        player = Player(bus, write_recording(tmp_path / "run.mcap", *entries), rate=AS_FAST_AS_POSSIBLE)
+
+        def jump(_: Batch) -> None:
+            if len(heard.entries) in seeks:
+                player.seek(seeks[len(heard.entries)])
+
+        bus.subscribe(jump)
+        await player.play()
         bus.close()
-        # Only of the one that goes back.
         told = [type(event) async for event in events if isinstance(event, (ClockReset, FrameRemoved))]
-        assert told == [ClockReset if simulated else FrameRemoved]
-    rig, first, second, third = (batch for _, batch in entries)
-    assert heard.batches == [rig, first, rig, second, rig, first, rig, third]
+    assert told == [ClockReset if simulated else FrameRemoved]
+    assert heard.batches == [entry[1] for entry in (rig, first, rig, second, rig, first, rig, third)]
+    if simulated:
+        assert [now for now, _ in heard.entries] == [
+            START + hours * 3_600 * SECOND for hours in (0, 0, 1, 1, 0, 0, 2, 2)
+        ]
     assert player.passes == 1
 
 
@@ -376,31 +350,49 @@ async def test_a_loop_ends_where_there_is_nothing_to_play(tmp_path: Path) -> Non
     assert (player.played, player.passes, player.position) == (0, 2, None)
 
 
-def in_virtual_time(function: Callable[[], Awaitable[None]]) -> None:
-    """Run with trio's own clock, which jumps to the next deadline whenever nothing runs."""
-    clock = MockClock(autojump_threshold=0)
-    anyio.run(function, backend="trio", backend_options={"clock": clock})
-
-
-@pytest.mark.parametrize("rate", [1.0, 2.0, 0.25])
-@pytest.mark.parametrize(
-    ("simulated", "times"),
-    [(True, (0.0, 0.5, 0.501, 9.0)), (False, (0.0, 0.5, 0.501, 86_400.0))],
-    ids=["simulated", "system"],
-)
-def test_each_message_is_published_at_its_time(
-    tmp_path: Path, rate: float, simulated: bool, times: tuple[float, ...]
-) -> None:
-    path = write_recording(tmp_path / "run.mcap", *drive(times))
+def times_in(
+    path: Path,
+    steer: Callable[[Player, Listener], Awaitable[None]] | None = None,
+    *,
+    simulated: bool = True,
+    **options: Any,
+) -> list[float]:
+    """The times at which messages are heard, in s since the call of `play`; `steer` commands the player meanwhile."""
+    times: list[float] = []
 
     async def play() -> None:
-        with Bus(SimulatedClock() if simulated else None) as bus:
-            bus.subscribe(lambda _: heard.append(anyio.current_time()))
-            await Player(bus, path, rate=rate).play()
+        # The clock of the loop is not at zero at the beginning.
+        await anyio.sleep(1_000.0)
+        begin = anyio.current_time()
+        with Bus(SimulatedClock(START) if simulated else None) as bus:
+            # Without a limit: the clock of the loop jumps to it while a thread reads.
+            heard, player = Listener(bus, math.inf), Player(bus, path, **options)
+            bus.subscribe(lambda _: times.append(anyio.current_time() - begin))
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(player.play)
+                if steer is not None:
+                    await steer(player, heard)
 
-    heard: list[float] = []
-    in_virtual_time(play)
-    assert [time - heard[0] for time in heard] == pytest.approx([time / rate for time in times], abs=1e-6)
+    # trio's own clock jumps to the next deadline whenever nothing runs.
+    anyio.run(play, backend="trio", backend_options={"clock": MockClock(autojump_threshold=0)})
+    return times
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+@pytest.mark.parametrize(
+    ("rate", "times"),
+    [
+        *((rate, (0.0, 0.5, 0.501, 9.0)) for rate in (1.0, 2.0, 0.25)),
+        (1e-9, (0.0, 3e-9)),
+        *((rate, (0.0, 1.0, 1_000_000.0)) for rate in (1e12, 1e300, AS_FAST_AS_POSSIBLE)),
+    ],
+)
+def test_each_message_is_published_at_its_time(
+    tmp_path: Path, simulated: bool, rate: float, times: tuple[float, ...]
+) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive(times))
+    expected = [time / rate for time in times]
+    assert times_in(path, simulated=simulated, rate=rate) == pytest.approx(expected, abs=2e-6)
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -408,178 +400,97 @@ def test_each_message_is_published_at_its_time(
 def test_a_pause_and_a_new_rate_count_from_their_moment(
     tmp_path: Path, simulated: bool, rate: float | None, left: float
 ) -> None:
+    async def steer(player: Player, heard: Listener) -> None:
+        await heard.until(1)
+        await anyio.sleep(3.0)
+        player.pause()
+        await anyio.sleep(100.0)
+        player.resume()
+        if rate is not None:
+            await anyio.sleep(2.0)
+            player.rate = rate
+
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
-    heard: list[float] = []
-
-    async def play() -> None:
-        # The clock of the loop is not at zero at the beginning.
-        await anyio.sleep(1_000.0)
-        with Bus(SimulatedClock() if simulated else None) as bus:
-            first = anyio.Event()
-
-            def hear(_: Batch) -> None:
-                heard.append(anyio.current_time())
-                first.set()
-
-            bus.subscribe(hear)
-            player = Player(bus, path)
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(player.play)
-                await first.wait()
-                await anyio.sleep(3.0)
-                player.pause()
-                await anyio.sleep(100.0)
-                player.resume()
-                if rate is not None:
-                    await anyio.sleep(2.0)
-                    player.rate = rate
-
-    in_virtual_time(play)
-    assert heard[1] - heard[0] == pytest.approx(3.0 + 100.0 + left, abs=1e-6)
+    expected = [0.0, 3.0 + 100.0 + left]
+    assert times_in(path, steer, simulated=simulated) == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize("simulated", [True, False])
 @pytest.mark.parametrize(
     ("goes_on", "left"),
-    [(Player.resume, 10.0), (Player.step, 0.0), (lambda player: setattr(player, "rate", 5.0), math.inf)],
+    # Another rate alone does not end the pause.
+    [(Player.resume, 10.0), (Player.step, 0.0), (lambda player: setattr(player, "rate", 5.0), 1_000.0 + 10.0 / 5.0)],
     ids=["resume", "step", "rate"],
 )
 def test_a_paused_player_that_waits_is_woken_by_what_makes_it_go_on(
     tmp_path: Path, simulated: bool, goes_on: Callable[[Player], None], left: float
 ) -> None:
+    async def steer(player: Player, heard: Listener) -> None:
+        await heard.until(1)
+        player.pause()
+        await anyio.sleep(100.0)
+        goes_on(player)
+        with anyio.move_on_after(1_000.0):
+            await heard.until(2)
+        player.resume()
+
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
-    heard: list[float] = []
-
-    async def play() -> None:
-        with Bus(SimulatedClock() if simulated else None) as bus:
-            events = [anyio.Event(), anyio.Event()]
-
-            def hear(_: Batch) -> None:
-                events[len(heard)].set()
-                heard.append(anyio.current_time())
-
-            bus.subscribe(hear)
-            player = Player(bus, path)
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(player.play)
-                await events[0].wait()
-                player.pause()
-                await anyio.sleep(100.0)
-                goes_on(player)
-                with anyio.move_on_after(1_000.0):
-                    await events[1].wait()
-                tasks.cancel_scope.cancel()
-
-    in_virtual_time(play)
-    # Another rate alone does not end the pause.
-    assert [time - heard[0] for time in heard] == pytest.approx([0.0, 100.0 + left][: 1 + (left < math.inf)], abs=1e-6)
+    assert times_in(path, steer, simulated=simulated) == pytest.approx([0.0, 100.0 + left], abs=1e-6)
 
 
 @pytest.mark.parametrize("simulated", [True, False])
 def test_a_seek_is_followed_at_once_and_a_pause_lasts_beyond_it(tmp_path: Path, simulated: bool) -> None:
+    async def steer(player: Player, heard: Listener) -> None:
+        await heard.until(1)
+        await anyio.sleep(3.0)
+        player.seek(START + 1_000 * SECOND)
+        await heard.until(2)
+        player.pause()
+        await anyio.sleep(100.0)
+        player.seek(START + 1_000 * SECOND)
+        await anyio.sleep(100.0)
+        player.step()
+        await heard.until(3)
+        player.seek(START + 1_999 * SECOND)
+        player.resume()
+        await heard.until(4)
+        assert heard.batches == [(moving("map", "base", START + x * SECOND, float(x), "odometry"),) for x in stops]
+
+    stops = (0, 1_000, 1_000, 2_000)
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1_000.0, 2_000.0)))
-    times: list[float] = []
-
-    async def until(heard: Listener, count: int) -> None:
-        # Without a limit: this clock jumps to it while a thread reads.
-        while len(heard.entries) < count:
-            heard.arrived = anyio.Event()
-            await heard.arrived.wait()
-
-    async def play() -> None:
-        with Bus(SimulatedClock() if simulated else None) as bus:
-            heard = Listener(bus)
-            bus.subscribe(lambda _: times.append(anyio.current_time()))
-            player = Player(bus, path)
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(player.play)
-                await until(heard, 1)
-                await anyio.sleep(3.0)
-                player.seek(START + 1_000 * SECOND)
-                await until(heard, 2)
-                player.pause()
-                await anyio.sleep(100.0)
-                player.seek(START + 1_000 * SECOND)
-                await anyio.sleep(100.0)
-                player.step()
-                await until(heard, 3)
-                player.seek(START + 1_999 * SECOND)
-                player.resume()
-            assert [batch[0].stamp for batch in heard.batches] == [
-                START + seconds * SECOND for seconds in (0, 1_000, 1_000, 2_000)
-            ]
-
-    in_virtual_time(play)
     # The second at once, the third when the step is taken; of the last, a second is left.
-    assert [time - times[0] for time in times] == pytest.approx([0.0, 3.0, 203.0, 204.0], abs=1e-6)
-
-
-@pytest.mark.parametrize("simulated", [True, False])
-@pytest.mark.parametrize("rate", [1e12, 1e300, AS_FAST_AS_POSSIBLE])
-async def test_the_highest_rates_wait_for_nothing(tmp_path: Path, simulated: bool, rate: float) -> None:
-    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0, 1_000_000.0)))
-    with Bus(SimulatedClock() if simulated else None) as bus, anyio.fail_after(PATIENCE):
-        player = Player(bus, path, rate=rate)
-        await player.play()
-    assert player.played == 3
-
-
-def test_at_the_lowest_rates_a_simulated_clock_still_advances(tmp_path: Path) -> None:
-    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 3e-9)))
-    heard: list[float] = []
-
-    async def play() -> None:
-        with Bus(SimulatedClock()) as bus:
-            bus.subscribe(lambda _: heard.append(anyio.current_time()))
-            await Player(bus, path, rate=1e-9).play()
-
-    in_virtual_time(play)
-    assert heard[1] - heard[0] == pytest.approx(3.0)
-
-
-@pytest.mark.parametrize("finish", [True, False])
-async def test_the_event_loop_does_not_read_the_file(tmp_path: Path, finish: bool) -> None:
-    lines = [(received, "/tf", batch) for received, batch in drive((0.0, 0.5))]
-    path = write_mcap(tmp_path / "run.mcap", lines, finish=finish)
-    with Bus(SimulatedClock()) as bus, reads_of(path) as readers:
-        await Player(bus, path, rate=AS_FAST_AS_POSSIBLE).play()
-    assert readers
-    assert threading.get_ident() not in readers
+    assert times_in(path, steer, simulated=simulated) == pytest.approx([0.0, 3.0, 203.0, 204.0], abs=1e-6)
 
 
 def test_a_simulated_clock_advances_steadily_between_messages(tmp_path: Path) -> None:
-    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
     seen: list[float] = []
 
-    async def tick(bus: Bus) -> None:
-        async for number in bus.clock.ticks(50.0):
-            assert bus.clock.now() == START + number * SECOND // 50
+    async def tick(player: Player, _: Listener) -> None:
+        async for number in player.bus.clock.ticks(50.0):
+            assert player.bus.clock.now() == START + number * SECOND // 50
             seen.append(anyio.current_time())
+            if number == 500:
+                return
 
-    async def play() -> None:
-        with Bus(SimulatedClock(START)) as bus:
-            async with anyio.create_task_group() as tasks:
-                tasks.start_soon(tick, bus)
-                await Player(bus, path, rate=4.0).play()
-                tasks.cancel_scope.cancel()
-
-    in_virtual_time(play)
-    assert len(seen) == 501
+    assert times_in(write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0))), tick, rate=4.0)[-1] == 2.5
     # A step is 20 ms.
     assert all(abs(number / 50.0 / 4.0 - (time - seen[0])) < 0.021 for number, time in enumerate(seen))
 
 
 def test_a_range_begins_at_since_even_if_the_first_message_is_later(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
+    assert times_in(path, simulated=False, since=START + 4 * SECOND) == pytest.approx([6.0], abs=1e-6)
 
-    async def play() -> None:
-        with Bus() as bus:
-            player = Player(bus, path, since=START + 4 * SECOND)
-            before = anyio.current_time()
-            await player.play()
-            assert anyio.current_time() - before == pytest.approx(6.0, abs=1e-6)
 
-    in_virtual_time(play)
+@pytest.mark.parametrize("finish", [True, False])
+async def test_the_event_loop_does_not_read_the_file(tmp_path: Path, finish: bool) -> None:
+    lines = [(received, "/tf", batch) for received, batch in drive((0.0, 0.5))]
+    path = write_mcap(tmp_path / "run.mcap", lines, finish=finish)
+    readers: set[int] = set()
+    with Bus(SimulatedClock()) as bus, before_opening(path, lambda: readers.add(threading.get_ident())):
+        await Player(bus, path, rate=AS_FAST_AS_POSSIBLE).play()
+    assert readers
+    assert threading.get_ident() not in readers
 
 
 @pytest.mark.parametrize(
@@ -631,6 +542,33 @@ def test_play_can_be_cancelled_under_plain_asyncio(tmp_path: Path) -> None:
             with pytest.raises(TimeoutError):
                 async with asyncio.timeout(0.01):
                     await player.play()
+
+    asyncio.run(main())
+
+
+def test_a_file_that_a_thread_opens_while_plain_asyncio_cancels_play_is_closed(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive((0.0,)))
+    go_on = threading.Event()
+
+    async def main() -> None:
+        loop, opening = asyncio.get_running_loop(), asyncio.Event()
+
+        def hold_the_thread() -> None:
+            loop.call_soon_threadsafe(opening.set)
+            go_on.wait(PATIENCE)
+
+        with Bus() as bus, before_opening(path, hold_the_thread):
+            task = asyncio.create_task(Player(bus, path).play())
+            await opening.wait()
+            task.cancel()
+            for _ in range(10):
+                await asyncio.sleep(0)
+            ended_early = task.done()
+            go_on.set()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            assert not ended_early
+            assert not is_open(path)
 
     asyncio.run(main())
 

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from io import BytesIO
 from itertools import count
@@ -27,7 +27,6 @@ from tfbus import (
     SECOND,
     Bus,
     BusClosedError,
-    Event,
     QueueStatistics,
     RecorderStatistics,
     RecordingDropped,
@@ -41,21 +40,8 @@ from tfbus.recording.recording import open_recording
 
 pytestmark = pytest.mark.anyio
 
-Run = Callable[[Callable[[], Awaitable[None]]], None]
-
 PATIENCE = 60.0
 """Real seconds after which a test that hangs is given up."""
-
-
-@pytest.fixture
-def bus() -> Iterator[Bus]:
-    with Bus(SimulatedClock()) as bus:
-        yield bus
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "run.mcap"
 
 
 def recorded(path: Path) -> list[tuple[int, tuple[TransformStamped, ...]]]:
@@ -165,7 +151,7 @@ async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(bus: Bus,
 
 async def test_a_flush_writes_all_that_is_pending_in_whatever_parts(bus: Bus, path: Path) -> None:
     async with Recorder(bus, path) as recorder:
-        # So many are written at once, and a quarter of them more.
+        # A slice has 4,096 samples; a quarter of that is left for a second one.
         for number in range(5_120):
             bus.publish(moving("map", "a", number))
         await recorder.flush()
@@ -222,6 +208,20 @@ async def test_a_few_samples_are_written_soon_without_a_flush(bus: Bus, path: Pa
             await until(lambda number=number: recorder.statistics().samples == number)  # type: ignore[misc]
 
 
+async def test_a_chunk_ends_every_half_second_and_not_with_each_write(bus: Bus, path: Path) -> None:
+    begin = anyio.current_time()
+    async with Recorder(bus, path):
+        for number in range(40):
+            bus.publish(moving("map", "a", number))
+            await anyio.sleep(0.01)
+    elapsed = anyio.current_time() - begin
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    # The first write ends one, and so does the end; there is a write every 50 ms.
+    assert len(summary.chunk_indexes) <= 2 + elapsed / 0.5
+
+
 async def test_each_time_that_dropping_begins_there_is_one_event(path: Path) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         # Also if something is pending from the beginning on.
@@ -273,7 +273,7 @@ async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_
 
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(record, bus)
-    # It hears of nothing any more.
+    # The recorder has left the bus.
     bus.publish(moving("map", "a", 1))
     (recorder,) = recorders
     assert offered(recorder.statistics()) == recorder.statistics().samples == 6_000
@@ -291,25 +291,23 @@ async def test_an_error_of_the_body_is_raised_as_it_is_and_the_file_is_whole(pat
 async def test_a_disk_that_fails_causes_an_event_and_the_body_goes_on(
     pipe: Pipe, caplog: pytest.LogCaptureFixture
 ) -> None:
-    heard: list[Event] = []
     with Bus(SimulatedClock(3 * SECOND)) as bus, bus.events() as events, anyio.fail_after(PATIENCE):
         async with Recorder(bus, pipe.path, overwrite=True) as recorder:
             pipe.break_off()
-            for sample in noise(100):
+            # More than are passed to the disk at once.
+            for sample in noise(5_000):
                 bus.publish(sample)
-            async for event in events:
-                if isinstance(event, RecordingFailed):
-                    heard.append(event)
-                    break
             await recorder.flush()
-            bus.publish(moving("map", "base", 1_000))
+            assert isinstance(recorder.error, BrokenPipeError)
+            bus.publish(moving("map", "base", 10_000))
             await settle()
         await recorder.flush()
-    assert isinstance(recorder.error, BrokenPipeError)
-    assert heard == [RecordingFailed(3 * SECOND, str(pipe.path), recorder.error)]
+        bus.close()
+        failures = [event async for event in events if isinstance(event, RecordingFailed)]
+    assert failures == [RecordingFailed(3 * SECOND, str(pipe.path), recorder.error)]
     statistics = recorder.statistics()
     # Also the one that was published later.
-    assert (statistics.samples, statistics.queue.pending, statistics.queue.dropped) == (0, 0, 101)
+    assert (statistics.samples, statistics.queue.pending, statistics.queue.dropped) == (0, 0, 5_001)
     assert ["has ended early, with 0 samples in it" in record.message for record in caplog.records] == [True]
 
 
@@ -379,19 +377,6 @@ async def test_a_disk_that_fails_at_the_end_causes_an_event_and_raises_nothing(p
     assert isinstance(recorder.error, BrokenPipeError)
 
 
-async def test_flush_returns_when_the_disk_fails(bus: Bus, pipe: Pipe) -> None:
-    async with Recorder(bus, pipe.path, overwrite=True) as recorder:
-        pipe.break_off()
-        for stamp in range(5_000):
-            bus.publish(moving("map", "a", stamp))
-        with anyio.fail_after(PATIENCE):
-            await recorder.flush()
-        assert isinstance(recorder.error, BrokenPipeError)
-    queue = recorder.statistics().queue
-    # Also what was not passed to the disk yet.
-    assert (queue.pending, queue.dropped) == (0, 5_000)
-
-
 KILLED = """
 import sys, anyio
 from tfbus import Bus, TransformBroadcaster, Transform
@@ -404,7 +389,7 @@ async def main():
             for stamp in range(1_000_000):
                 broadcaster.send("map", "base", Transform((1 / (stamp + 1), 0.0, 0.0)), at=stamp)
                 if stamp == 100 or stamp % 2_000 == 0:
-                    # Not to go on before the disk has it is not to ask for it: no flush.
+                    # The disk gets it in its own time: a flush would hurry it.
                     while recorder.statistics().samples <= stamp:
                         await anyio.sleep(0.01)
                     print(recorder.statistics().samples, flush=True)
@@ -560,34 +545,6 @@ def test_a_recorder_that_has_not_begun_has_a_name_and_counts_nothing(tmp_path: P
     assert recorder.statistics() == RecorderStatistics(0, 0, 0, {}, queue)
 
 
-def test_a_slice_has_at_least_one_batch_and_otherwise_no_more_samples_than_its_size() -> None:
-    queue = WriteQueue(100)
-    for size in (2, 3, 9, 1):
-        queue.put(tuple(moving("map", "a", stamp) for stamp in range(size)), 0)
-    assert [[len(batch) for _, batch in queue.get_slice(5)] for _ in range(3)] == [[2, 3], [9], [1]]
-
-
-def test_static_samples_of_dropped_batches_come_first_with_their_own_times() -> None:
-    queue = WriteQueue(1)
-    queue.put((static("map", "a"), moving("map", "b", 1)), 0)
-    queue.put((static("map", "c"), moving("map", "b", 2)), 1)
-    queue.put((moving("map", "b", 3),), 2)
-    assert len(queue) == 3
-    assert queue.get_slice(10) == [
-        (0, (static("map", "a"),)),
-        (1, (static("map", "c"),)),
-        (2, (moving("map", "b", 3),)),
-    ]
-
-
-def test_batches_of_static_samples_alone_are_bounded_and_the_replaced_ones_are_counted() -> None:
-    queue = WriteQueue(3)
-    for number in range(1_000):
-        queue.put((static("map", f"s{number % 2}", x=float(number)),), number)
-    assert queue.statistics("recording") == QueueStatistics("recording", "drop_oldest", 3, 5, 0, 995)
-    assert [sample.transform.translation[0] for _, (sample,) in queue.get_slice(10)] == [995, 996, 997, 998, 999]
-
-
 steps = st.lists(st.lists(any_samples("abc", 3), min_size=1, max_size=5) | st.integers(1, 8), max_size=40)
 
 
@@ -604,10 +561,15 @@ def test_every_sample_is_read_or_counted_and_the_newest_static_ones_are_read(
     read: list[tuple[int, TransformStamped]] = []
     for now, step in enumerate(steps):
         if isinstance(step, int):
-            read += [(published, sample) for published, batch in queue.get_slice(step) for sample in batch]
+            batches = queue.get_slice(step)
+            # A single batch may be larger, and so may the kept static samples.
+            assert len(batches) == 1 or sum(len(batch) for _, batch in batches) <= max(step, len("abc"))
+            read += [(published, sample) for published, batch in batches for sample in batch]
         else:
             queue.put(tuple(step), now)
             put += step
+        # Batches are bounded as well as samples, each has up to five, and a static sample of each child is kept.
+        assert len(queue) <= 5 * capacity + len("abc")
     # Within the capacity, except for a single batch that is larger.
     assert count_moving(put) - queue.dropped - count_moving([sample for _, sample in read]) <= max(capacity, 5)
     while batches := queue.get_slice(3):

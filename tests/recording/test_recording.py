@@ -9,19 +9,22 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.writer import Writer
+from hypothesis import example, given
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from support.processes import OPEN_FILES, is_open
-from support.recorded import SMALL, as_ros2, messages_in, without_unfinished, write_mcap
+from support.recorded import SMALL, Line, as_ros2, in_blocks, messages_in, without_unfinished, write_mcap
 from support.samples import moving, static
 
-from tfbus import InvalidTransformError, RecordingError
-from tfbus.recording import RecordedTopic, open_recording
+from tfbus import InvalidTransformError, RecordingError, TransformStamped
+from tfbus.recording import RecordedTopic, convert, open_recording
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.recording import Choice, Selection, looks_like_transforms
 from tfbus.tf_message import encode
@@ -52,30 +55,27 @@ def test_the_content_of_a_file_decides_its_format_not_its_name(tmp_path: Path, r
         assert unnamed == named
 
 
-def test_a_range_begins_with_the_newest_static_transform_of_each_frame_from_before(recording: Path) -> None:
-    first, second, third, fourth = messages_in(recording, 35, 50)
-    assert [message.received for message in (first, second)] == [35, 35]
-    # In the order in which they came last.
-    assert (first.batch, second.batch) == ((static("base", "camera", 1.0),), (static("base", "laser", 2.0),))
-    assert (third.received, third.batch) == (40, (moving("odom", "base", 40),))
-    assert (fourth.received, fourth.batch) == (50, (static("base", "laser", 3.0),))
+OLD_LASER, NEW_LASER, CAMERA = static("base", "laser", 1.0), static("base", "laser", 2.0), static("base", "camera", 1.0)
 
 
 @pytest.mark.parametrize(
-    ("since", "until", "times"),
+    ("since", "until", "before", "times"),
     [
-        (10, None, [10, 20, 30, 40, 50]),
-        # A static transform of each of two frames from before.
-        (11, None, [11, 11, 20, 30, 40, 50]),
-        (10 * SECOND, None, [10 * SECOND] * 2),
-        (None, 9, []),
-        (5, 3, []),
+        (10, None, [], [10, 20, 30, 40, 50]),
+        (11, None, [OLD_LASER, CAMERA], [20, 30, 40, 50]),
+        # In the order in which they came last.
+        (35, 50, [CAMERA, NEW_LASER], [40, 50]),
+        (10 * SECOND, None, [CAMERA, static("base", "laser", 3.0)], []),
+        (None, 9, [], []),
+        (5, 3, [], []),
     ],
 )
-def test_a_range_has_its_messages_and_each_static_transform_once(
-    recording: Path, since: int | None, until: int | None, times: list[int]
+def test_a_range_begins_with_the_newest_static_transform_of_each_frame_from_before(
+    recording: Path, since: int | None, until: int | None, before: list[TransformStamped], times: list[int]
 ) -> None:
-    assert [message.received for message in messages_in(recording, since, until)] == times
+    expected: list[tuple[int | None, tuple[TransformStamped, ...]]] = [(since, (sample,)) for sample in before]
+    expected += [(received, tuple(samples)) for received, _, samples in LINES if received in times]
+    assert [(message.received, message.batch) for message in messages_in(recording, since, until)] == expected
 
 
 def test_good_transforms_come_with_the_errors_of_the_bad_ones(tmp_path: Path) -> None:
@@ -87,6 +87,81 @@ def test_good_transforms_come_with_the_errors_of_the_bad_ones(tmp_path: Path) ->
     (error,) = message.errors
     assert isinstance(error, InvalidTransformError)
     assert (error.reason, error.child) == ("not finite", "c")
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "bag", "db3"])
+@given(
+    times=st.lists(st.integers(0, 30), max_size=40),
+    lengths=st.lists(st.integers(1, 3), min_size=1, max_size=5),
+    chunk_size=st.integers(1, 2_000),
+    ends=st.tuples(*[st.integers(0, 30)] * 2),
+)
+# One chunk has all messages.
+@example(times=[3, 1, 2], lengths=[1, 2], chunk_size=2_000, ends=(1, 2))
+# Each chunk ends behind the beginning of the next one, or of very many.
+@example(times=[k + (15 if k % 10 == 9 else 0) for k in range(200)], lengths=[1], chunk_size=500, ends=(40, 90))
+@example(times=[k + (100 if k % 10 == 9 else 0) for k in range(200)], lengths=[1], chunk_size=500, ends=(40, 90))
+def test_messages_are_ordered_by_log_time_wherever_they_are_in_the_file(
+    tmp_path_factory: pytest.TempPathFactory,
+    suffix: str,
+    times: list[int],
+    lengths: list[int],
+    chunk_size: int,
+    ends: tuple[int, int],
+) -> None:
+    # Frames with names of several lengths take turns, between messages of a topic that is not read.
+    lines: list[Line] = [
+        (time, "/tf", [moving("a", "b" * length, place)])
+        for place, (time, length) in enumerate(zip(times, cycle(lengths), strict=False))
+    ]
+    mixed = [each for line in lines for each in (line, (line[0], "/camera", b"picture"))]
+    folder = tmp_path_factory.mktemp("recording")
+    path = write_mcap(folder / "run.mcap", mixed, chunk_size=chunk_size)
+    if suffix != "mcap":
+        convert([path], path.with_suffix(f".{suffix}"))
+        path = path.with_suffix(f".{suffix}")
+    by_time = sorted((time, place) for place, time in enumerate(times))
+    for since, until in ((0, 300), ends):
+        expected = [(time, place) for time, place in by_time if since <= time <= until]
+        for messages in (messages_in(path, since, until), in_blocks(path, since, until)):
+            assert [(message.received, message.batch[0].stamp) for message in messages] == expected
+
+
+@pytest.mark.parametrize(
+    ("suffix", "options"),
+    [
+        ("mcap", {}),
+        ("mcap", {"compression": CompressionType.ZSTD}),
+        ("mcap", {"use_chunking": False}),
+        ("mcap", {"enable_crcs": False}),
+        ("bag", {}),
+    ],
+    ids=str,
+)
+@given(data=st.data())
+def test_one_flipped_bit_never_loses_a_message_in_silence(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, suffix: str, options: dict[str, Any]
+) -> None:
+    folder = tmp_path_factory.mktemp("recording")
+    lines = [(k, "/tf", [moving("odom", "base", k)]) for k in range(15)]
+    path = write_mcap(folder / "source.mcap", lines, chunk_size=500, **options)
+    if suffix == "bag":
+        convert([path], folder / "run.bag")
+        path = folder / "run.bag"
+    whole = bytearray(path.read_bytes())
+    whole[data.draw(st.integers(0, len(whole) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(whole)
+    try:
+        messages = messages_in(path)
+    except RecordingError:
+        return
+    with open_recording(path) as recording:
+        told = recording.remarks or not recording.finished
+    read = [(message.received, "/tf", list(message.batch)) for message in messages if message.batch]
+    if suffix == "mcap" and "enable_crcs" not in options and "use_chunking" not in options:
+        # A checksum holds the content of each chunk.
+        assert all(line in lines for line in read)
+    assert len(read) == 15 or told or any(message.errors for message in messages)
 
 
 def test_a_closed_recording_cannot_be_read(recording: Path) -> None:
@@ -268,7 +343,7 @@ def test_a_topic_that_was_asked_for_is_there_with_transforms(tmp_path: Path) -> 
         open_recording(path, topics="/camera")
     assert str(raised.value).endswith("topic 'camera' has type sensor_msgs/msg/Image, which holds no transforms")
     assert raised.value.reason == "no such topic"
-    # What an unfinished file has, only reading it tells.
+    # Only reading an unfinished file tells which topics it has.
     path = write_mcap(path, [(1, "/camera", b"")], schema="sensor_msgs/msg/Image", finish=False)
     with open_recording(path, topics="/camera") as recording:
         assert without_unfinished(recording.messages()) == []

@@ -54,7 +54,7 @@ def xs(samples: list[TransformStamped]) -> dict[str, float]:
     return {sample.child: sample.transform.translation[0] for sample in samples if not sample.static}
 
 
-# What is sent
+# Samples
 
 
 def test_fixed_joints_are_static_and_all_carry_stamp_authority_and_prefix() -> None:
@@ -136,7 +136,7 @@ def test_a_mimicking_joint_has_limits_too_of_which_one_may_be_missing() -> None:
     assert str(lower) == "joint 'j': position -2.5 is outside its limits, from -2 to inf"
 
 
-# What cannot be
+# Refusals
 
 
 @pytest.mark.parametrize("call", ["transforms", "moving_transforms"])

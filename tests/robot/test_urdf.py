@@ -43,6 +43,11 @@ def test_names_links_and_joints_come_in_the_order_of_the_file() -> None:
     assert [each.name for each in found.joints] == ["2", "1"]
 
 
+def test_a_namespace_of_the_whole_document_changes_nothing() -> None:
+    text = robot(LINKS, joint('<origin xyz="1 2 3"/>'))
+    assert read_urdf(text.replace("<robot", '<robot xmlns="http://example.org/urdf"')) == read_urdf(text)
+
+
 def test_all_fields_of_a_joint_are_read() -> None:
     found = only_joint(
         '<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/><axis xyz="0 0 2"/><mimic joint="k" multiplier="-2"'
@@ -135,31 +140,24 @@ def test_unknown_parts_of_a_link_are_ignored_silently(inside: str, capfd: pytest
     ("parts", "message"),
     [
         ('<link name="a"/><link/>', "in <link> number 2: Required attribute not set in XML: name"),
-        ("<link/>", "in <link> number 1: Required attribute not set in XML: name"),
         (joint(kind="ball"), 'in <joint name="j">: Invalid joint type: ball'),
         (joint(kind="unknown"), "in <joint name=\"j\">: type 'unknown' is none of fixed"),
-        ('<joint name="j"/>', 'in <joint name="j">: Required attribute not set in XML: type'),
         ('<joint type="fixed"/>', "in <joint> number 1: Required attribute not set in XML: name"),
         ('<joint name="j" type="fixed"><child link="b"/></joint>', 'in <joint name="j">: Required element not'),
         ('<joint name="j" type="fixed"><parent/></joint>', 'in <joint name="j">: <parent> has no link'),
         (joint("<axis/>"), 'in <joint name="j">: <axis> has no xyz'),
         (joint('<axis xyz="0 0 0"/>', "revolute"), 'in <joint name="j">: axis (0.0, 0.0, 0.0) has no direction'),
-        (joint('<axis xyz="0 x 0"/>', "revolute"), 'in <joint name="j">: '),
         (joint('<origin xyz="1 2"/>'), 'in <joint name="j">: origin[@xyz]: Invalid vector length'),
         (joint('<origin xyz="1 2 x"/>'), "in <joint name=\"j\">: origin[@xyz]: could not convert string to float: 'x'"),
         (joint('<origin xyz="1 2 nan"/>'), 'in <joint name="j">: origin: translation [1.0, 2.0, nan] is not finite'),
-        (joint('<origin rpy="0 inf 0"/>'), 'in <joint name="j">: origin: rpy [0.0, inf, 0.0] is not finite'),
         (joint("<origin/><origin/>"), 'in <joint name="j">: there is more than one <origin>'),
         (joint('<limit lower="0"/>', "revolute"), 'in <joint name="j">: limit: Required attribute not set in XML: '),
         (joint("<mimic/>"), 'in <joint name="j">: mimic: Required attribute not set in XML: joint'),
         (joint('<mimic joint="k" offset="nan"/>'), 'in <joint name="j">: a limit or the mimic is NaN'),
         ('<link name="a"><visual/></link>', 'in <link name="a">: visual[1]: Required element not set in XML: geometry'),
-        ('<link name="a"><visual><geometry/></visual></link>', 'in <link name="a">: '),
         ('<link name="a"><inertial><mass/></inertial></link>', 'in <link name="a">: <mass> has no value'),
-        ('<link name="a"><inertial><mass value="x"/></inertial></link>', 'in <link name="a">: '),
         ('<material name="m"/>', 'in <material name="m">: it has neither a color nor a texture'),
         ('<material><color rgba="1 1 1 1"/></material>', "in <material> number 1: Required attribute not set in XML"),
-        ('<material name="m"><color rgba="1 1"/></material>', 'in <material name="m">: color'),
     ],
 )
 def test_the_error_names_the_malformed_element(parts: str, message: str, capfd: pytest.CaptureFixture[str]) -> None:
@@ -171,9 +169,7 @@ def test_the_error_names_the_malformed_element(parts: str, message: str, capfd: 
     ("text", "message"),
     [
         ("<robot", "it is not well-formed XML: unclosed token: line 1, column 0"),
-        ('<robot name="r"><link name="a"></robot>', "it is not well-formed XML: mismatched tag: line 1, column 33"),
         ('<robot name="r"><x:link name="a"/></robot>', "it is not well-formed XML: unbound prefix"),
-        ('<robot name="r">\x00</robot>', "it is not well-formed XML: "),
         ('<?xml version="1.0" encoding="none-such"?><robot/>', "in <robot>: Required attribute not set in XML: name"),
         ("<robot/>\ud800", "it is not well-formed XML: "),
         ("<sdf version='1.6'/>", "a URDF is a <robot>, but this is a <sdf>"),
@@ -199,7 +195,6 @@ def test_a_file_of_another_kind_is_refused(content: bytes, tmp_path: Path) -> No
     [
         ('<xacro:include filename="arm.xacro"/>', "in <xacro:include>: this is still to be expanded: run xacro"),
         ('<xacro:macro name="arm"/>', 'in <xacro:macro name="arm">: this is still to be expanded'),
-        ('<xacro:if value="1"/>', "in <xacro:if>: this is still to be expanded"),
         (joint('<xacro:insert_block name="o"/>'), 'in <xacro:insert_block name="o">: this is still to be expanded'),
         ('<link name="a"><xacro:inertia m="1"/></link>', "in <xacro:inertia>: this is still to be expanded"),
         (joint('<origin xyz="0 0 ${h}"/>'), "in <joint name=\"j\">: '0 0 ${h}' is still to be expanded: run xacro"),
@@ -243,19 +238,6 @@ def test_an_error_about_an_element_pickles() -> None:
         read_urdf(robot(joint('<origin xyz="1 2 x"/>')))
     twin = pickle.loads(pickle.dumps(caught.value))
     assert (str(twin), twin.element, twin.__cause__) == (str(caught.value), '<joint name="j">', None)
-
-
-@pytest.mark.thorough
-def test_without_urdf_parser_py_the_error_names_the_extra() -> None:
-    hidden = (
-        "import sys; sys.modules['urdf_parser_py'] = None\n"
-        "import tfbus\n"
-        "try: tfbus.RobotModel.from_urdf('<robot/>')\n"
-        "except ImportError as error: print(error)"
-    )
-    done = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True, check=True)
-    expected = 'to read URDF, tfbus needs a package more: pip install "tfbus[urdf]", or ".[urdf]" in a checkout\n'
-    assert done.stdout == expected
 
 
 @pytest.mark.thorough
@@ -327,12 +309,9 @@ def test_a_link_has_any_number_of_visuals_in_the_order_of_the_file() -> None:
 @pytest.mark.parametrize(
     "shape", ['<sphere radius="nan"/>', '<box size="1 inf 1"/>', '<mesh filename="a" scale="nan 1 1"/>']
 )
-def test_a_size_that_is_not_finite_names_its_link(shape: str) -> None:
+def test_a_size_or_an_origin_that_is_not_finite_names_its_link(shape: str) -> None:
     with pytest.raises(InvalidRobotError, match=r'<link name="base">.*not finite'):
         read_visuals(shaped(shape))
-
-
-def test_an_origin_that_is_not_finite_names_its_link() -> None:
     with pytest.raises(InvalidRobotError, match='<link name="base">: origin'):
         read_visuals(shaped('<sphere radius="1"/>', '<origin xyz="nan 0 0"/>'))
 

@@ -79,7 +79,7 @@ class World:
         authority = "you" if rng.random() < 0.01 else "me"
         return tfbus.TransformStamped(parent, child, self.stamp(), transform, authority, rng.random() < 0.01)
 
-    # What may happen
+    # Steps
 
     def publish(self) -> None:
         rng = self.rng
@@ -163,52 +163,14 @@ class World:
             if not asked.cancelled:
                 self.say(lambda asked=asked: bits_of(asked.answer))  # type: ignore[misc]
 
-    def ask_closely(self) -> None:
-        """Questions that Python answers on both kernels, by what the kernel has stored."""
-        rng, stamp = self.rng, self.stamp()
-        tree, (target, source, at) = rng.choice(self.buffers).tree, self.question()
-        durations = (0.0, 1e-9, 1e-6, 4e9, 9.2e9, math.inf)
-        policy = {
-            "tolerance": rng.choice(durations),
-            "max_gap": rng.choice((None, *durations)),
-            "extrapolate": self.tfbus.Hold(rng.choice(durations)),
-        }
-        stamps = [self.stamp() for _ in range(3)]
-        # The names of the frames are those of the buffer.
-        self.say(lambda: tree.lookup(target, source, at, **policy).stamp)
-        self.say(lambda: tree.lookup(target, source, at, source_at=stamp, fixed=rng.choice(FRAMES)).stamp)
-        self.say(lambda: tree.lookup_many(target, source, stamps, out_of_range="nan", **policy).valid.tolist())
-        self.say(lambda: str(tree.explain(target, source, at, **policy)))
-        self.say(lambda: tree.twist(target, source, at).stamp)
-        self.say(lambda: [around and around.stamp for around in tree.samples_around(source, stamp)])
-        self.say(lambda: (tree.describe(), tree.to_yaml(), tree.to_dot(), tree.parent(source, at)))
-        self.say(lambda: self.forget(tree.copy(), stamp))
-
-    def forget(self, tree: Any, stamp: int) -> object:
-        tree.forget_before(stamp)
-        return [(edge.child, edge.oldest, edge.newest, edge.rate) for edge in tree.edges()]
-
     def cancel(self) -> None:
         if self.asked:
             self.rng.choice(self.asked[-9:]).cancel()
 
-    def copy(self) -> None:
-        self.said.append(len(self.rng.choice(self.buffers).tree.copy().edges()))
-
     def step(self) -> None:
-        rng = self.rng
-        common: tuple[Callable[[], None], ...] = (
-            self.publish,
-            self.publish,
-            self.step_each_edge,
-            self.step_each_edge,
-            self.wait,
-            self.look_up,
-        )
-        rare = (self.remove, self.move_clock, self.add_buffer, self.close_buffer, self.listen, self.cancel, self.copy)
-        if self.limits > 0.1:
-            common = (*common, self.ask_closely)
-        rng.choice(common if rng.random() < 0.9 else rare)()
+        common = (self.publish, self.publish, self.step_each_edge, self.step_each_edge, self.wait, self.look_up)
+        rare = (self.remove, self.move_clock, self.add_buffer, self.close_buffer, self.listen, self.cancel)
+        self.rng.choice(common if self.rng.random() < 0.9 else rare)()
 
     def state(self) -> object:
         """Everything that can be seen."""
@@ -220,7 +182,7 @@ class World:
             )
             for buffer in self.buffers
         ]
-        return trees, repr(self.bus.statistics())
+        return trees, [buffer.tree.to_yaml() for buffer in self.buffers], repr(self.bus.statistics())
 
 
 def run(seed: int, steps: int, limits: float = 0.01) -> None:

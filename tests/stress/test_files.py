@@ -1,6 +1,5 @@
 """Files that are cut, damaged or hostile: nothing but the documented errors, and whatever is missing is told."""
 
-import bz2
 import os
 import random
 import sqlite3
@@ -19,7 +18,6 @@ from support.samples import moving
 
 from tfbus import RecordingError
 from tfbus.recording import convert, examine, load, open_recording
-from tfbus.recording.formats.storage import UnfoldBudget, UnfoldError, unfold
 from tfbus.recording.recording import Problems
 from tfbus.recording.summary import summarise
 from tfbus.tf_message import encode
@@ -178,21 +176,6 @@ def test_all_chunks_of_a_small_file_together_unfold_to_a_bound(tmp_path: Path) -
     assert load(path, problems=problems).frames() == ["a", "b", "c"]
     assert problems == {"damaged": 2, "unfinished": 1}
     assert "the chunks before it hold more bytes than the bound for a file of its size" in problems.details[0]
-
-
-@pytest.mark.parametrize("kind", ["zstd", "bz2"])
-def test_a_budget_counts_what_is_unfolded_and_damaged_data_as_their_limit(kind: str) -> None:
-    folded = {"zstd": zstandard.compress, "bz2": bz2.compress}[kind](bytes(600))
-    budget = UnfoldBudget(1_000)
-    assert unfold(b"abc", "none", 10, budget=budget) == b"abc"
-    assert unfold(folded, kind, 600, budget=budget) == unfold(folded, kind, 600, budget=budget) == bytes(600)
-    with pytest.raises(UnfoldError, match="the chunks before it hold more bytes than the bound"):
-        unfold(folded, kind, 600, budget=budget)
-    budget = UnfoldBudget(1_000)
-    with pytest.raises(UnfoldError, match="cannot be decompressed"):
-        unfold(bytes(20), kind, 1_000, budget=budget)
-    with pytest.raises(UnfoldError, match="the chunks before it hold more bytes than the bound"):
-        unfold(folded, kind, 600, budget=budget)
 
 
 def test_a_chunk_that_an_index_names_twice_is_read_once(tmp_path: Path) -> None:

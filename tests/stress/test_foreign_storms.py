@@ -104,7 +104,8 @@ def arm(stamp: int) -> ForeignTransform:
     return ForeignTransform("map", "arm", stamp, float(stamp))
 
 
-LIDAR = ForeignTransform("arm", "lidar", 0, 3.0)
+def lidar(x: float) -> ForeignTransform:
+    return ForeignTransform("arm", "lidar", 0, x)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -115,7 +116,7 @@ def test_two_links_of_one_bus_in_one_world_give_each_sample_once(seed: int) -> N
         world.say(arm(stamp))
         net.buses[0].publish(moving("map", "base", stamp))
         if stamp == 50:
-            world.say(LIDAR, static=True)
+            world.say(lidar(3.0), static=True)
     net.settle()
     assert len(net.heard[0]) == 201
     assert Counter((sample.child, sample.stamp) for sample in net.heard[0]).most_common(1)[0][1] == 1
@@ -143,7 +144,7 @@ def test_a_ring_of_three_buses_with_two_worlds_and_a_domain_hears_each_sample_on
         ros2.say(ForeignTransform("map", "leg", stamp, 1.0))
         net.buses[stamp % 3].publish(moving("map", "base", stamp))
         if stamp % 10 == 0:
-            ros1.say(LIDAR._replace(x=float(stamp)), static=True)
+            ros1.say(lidar(float(stamp)), static=True)
             net.settle()
     net.settle()
     expected = {(child, stamp) for child in ("arm", "leg", "base") for stamp in range(30)}

@@ -221,9 +221,7 @@ def processes() -> Iterator[Crowd]:
         yield together
 
 
-def test_those_that_cannot_reach_each_other_when_they_start_meet_when_they_can(
-    hosts: list[Host], processes: Crowd
-) -> None:
+def test_hosts_that_cannot_reach_each_other_at_first_meet_when_they_can(hosts: list[Host], processes: Crowd) -> None:
     three = hosts[:3]
     world = World(three, processes, Random(SEED), apart=three[1:])
     while world.peers() != [2, 1, 1]:
@@ -233,6 +231,18 @@ def test_those_that_cannot_reach_each_other_when_they_start_meet_when_they_can(
     assert world.peers() == [2, 1, 1]
     world.mend()
     world.check_equal()
+
+
+def test_hosts_without_an_address_hear_only_themselves(hosts: list[Host], processes: Crowd) -> None:
+    domain = {"domain": new_domain()}
+    apart, one, two = (processes.add(domain, prefix=host.prefix) for host in (hosts[0], hosts[1], hosts[1]))
+    for process in (one, two):
+        process.ask("until", peers=1)
+    apart.ask("statics", names=["apart"])
+    one.ask("statics", names=["together"])
+    two.ask("until", static=["together"])
+    assert two.ask("facts")["static"] == ["together"]
+    assert apart.ask("facts")["links"][0]["peers"] == 0
 
 
 def test_after_each_fault_all_buses_hold_the_same_frames(

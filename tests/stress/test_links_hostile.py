@@ -1,17 +1,14 @@
 """Programs that speak zenoh and send anything they like cannot break a link."""
 
 import struct
-import threading
-import time
 from collections.abc import Iterator
 from queue import Queue
-from random import Random
 from typing import Any
 from uuid import uuid4
 
 import pytest
 import zenoh
-from support.processes import PATIENCE, Crowd, PeerProcess, crowd, free_ports, new_domain
+from support.processes import PATIENCE, PeerProcess, crowd, free_ports, new_domain
 from support.samples import moving
 
 from tfbus import TransformStamped
@@ -23,8 +20,6 @@ from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.thorough
 
-NAMED = encode([moving("map", f"aaaaaaaa{number}", 0) for number in range(5_000)])
-STATICS = [f"fixed {number}" for number in range(50)]
 NAN = struct.pack("<d", float("nan"))
 Message = tuple[bytes, bytes]
 
@@ -172,140 +167,3 @@ def test_forged_senders_are_limited_in_number_and_keep_no_announced_peer_out(sce
     stranger.send(moving("map", "newcomer", 1))
     scene.victim.ask("until", has=["newcomer"])
     token.undeclare()
-
-
-def test_a_thousand_tokens_are_a_thousand_peers_and_go_with_their_session(scene: Scene) -> None:
-    stranger = scene.stranger
-    names = [uuid4().hex for _ in range(2 * MAX_PEERS)] + [f"robot{i}" for i in range(100)] + ["*", "**"]
-    tokens = [stranger.session.liveliness().declare_token(f"{stranger.prefix}/~/@alive/{name}/0") for name in names]
-    known = scene.friend.ask("facts")["ids"][0]
-    stranger.send(moving("map", "last", 1), key=f"{stranger.prefix}/~/live/{known}")
-    scene.victim.ask("until", has=["last"], peers=MAX_PEERS)
-    scene.victim.ask("until", peers=MAX_PEERS)
-    scene.check_announced("key", "too many tokens")
-    stranger.session.close()
-    scene.victim.ask("until", peers=1)
-    assert len(tokens) == len(names)
-
-
-# A flood of everything.
-
-
-@pytest.fixture
-def processes() -> Iterator[Crowd]:
-    with crowd() as together:
-        yield together
-
-
-class Flood(threading.Thread):
-    """A program that speaks zenoh, sends everything there is to a domain, and then ends."""
-
-    def __init__(self, domain: str, address: str, victim: str, forged: str) -> None:
-        super().__init__()
-        self.session = zenoh.open(settings([], address, None, 2.0))
-        self.prefix = f"tfbus/{domain}"
-        self.victim = victim
-        self.forged = forged
-        self.rounds = 0
-
-    def run(self) -> None:
-        try:
-            # What is sent before the victim's subscription has arrived here reaches nobody.
-            live = self.session.declare_publisher(f"{self.prefix}/~/live/{'f' * 32}")
-            while not live.matching_status.matching:  # type: ignore[attr-defined]
-                time.sleep(0.01)
-            for number in range(200):
-                self.send(number)
-                self.rounds += 1
-            self.flush()
-        finally:
-            self.session.close()
-
-    def flush(self) -> None:
-        """Wait until the victim has received all: what is still on its way when a session closes is lost."""
-        # The victim drops a question that it cannot read, and that is the end of its answers.
-        received = threading.Event()
-        end: Any = zenoh.handlers.Callback(lambda _: None, received.set, indirect=False)
-        self.session.get(
-            f"{self.prefix}/*/state/{self.victim}",
-            end,
-            timeout=PATIENCE,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-        )
-        assert received.wait(PATIENCE)
-
-    def send(self, number: int) -> None:
-        rng, me = Random(number), uuid4().hex
-        block = zenoh.CongestionControl.BLOCK
-
-        def put(key: str, payload: bytes, attachment: bytes) -> None:
-            self.session.put(f"{self.prefix}/{key}", payload, attachment=attachment, congestion_control=block)
-
-        put("~/live/nobody", b"", b"")
-        for _ in range(20):
-            put(f"~/live/{me}", rng.randbytes(rng.randrange(2_000)), rng.randbytes(rng.randrange(200)))
-            put(f"~/live/{uuid4().hex}", b"", rng.randbytes(20))
-            put(f"~/live/{me}", rng.randbytes(50), rng.randbytes(50))
-        put(f"~/live/{self.forged}", b"\x01", b"\x01")
-        # A million names, all from one peer.
-        payload = NAMED.replace(b"a" * 8, b"%08d" % number)
-        put(f"~/live/{'f' * 32}", payload, pack(0, [PublishedBatch(b"f" * 16, number, (("flood", False, 5_000),))]))
-        if number % 50 == 0:
-            put(f"~/live/{me}", bytes(MAX_BYTES + 1), b"")
-
-
-def messages_counted(link: dict[str, Any]) -> int:
-    """The number of messages that a link has rejected whole, or dropped from its queue."""
-    rejected: dict[str, int] = link["rejected"]
-    whole = sum(number for reason, number in rejected.items() if reason != "too many frames")
-    return whole + int(link["queue"]["dropped"])
-
-
-def test_a_flood_of_everything_is_counted_and_announced_and_harms_nobody(processes: Crowd) -> None:
-    domain, address = new_domain(), f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    # Fewer frames than the victim's reader of events has room for.
-    victim = processes.add({"domain": domain, "listen": address, "max_frames": 500})
-    good = processes.add({"domain": domain, "connect": address})
-    for process in (victim, good):
-        process.ask("until", peers=1)
-    good.ask("stream", authority="wheels", batches=10, rate=100.0)
-    victim.ask("until", last={"wheels": 9})
-    before = victim.ask("facts")
-    flood = Flood(domain, address, before["ids"][0], good.ask("facts")["ids"][0])
-    streaming = good.start("stream", authority="wheels", batches=200, rate=100.0, start=10)
-    flood.start()
-    try:
-        while flood.is_alive():
-            # It still answers.
-            victim.ask("facts")
-            flood.join(0.1)
-    finally:
-        flood.join(PATIENCE)
-    assert flood.rounds == 200
-    good.finish(streaming)
-    good.ask("statics", names=STATICS, authority="urdf")
-    good.ask("stream", authority="wheels", batches=10, rate=100.0, start=210)
-    victim.ask("until", last={"wheels": 219}, static=STATICS)
-    # The flood has a connection of its own, so its last messages may come after those of the good peer.
-    patience = time.monotonic() + PATIENCE
-    after = victim.ask("facts")
-    while messages_counted(after["links"][0]) < 200 * 62 and time.monotonic() < patience:
-        time.sleep(0.1)
-        after = victim.ask("facts")
-    tally, link = after["tallies"]["wheels"], after["links"][0]
-    assert tally["batches"] + tally["missing"] == 220
-    # Two that are published in one turn are one message.
-    assert tally["missing"] <= 2 * link["lost"]
-    assert (tally["not_in_order"], tally["not_whole"]) == (0, 0)
-    assert after["tallies"]["flood"]["samples"] == 500
-    announced = {said["reason"] for said in victim.said(event="PeerRejected")}
-    # What it has not announced by now may still be on its way.
-    announced |= {
-        victim.wait(event="PeerRejected", reason=reason)["reason"] for reason in link["rejected"].keys() - announced
-    }
-    assert announced >= {"key", "version", "attachment", "oversized", "too many frames"}
-    assert link["rejected"].keys() == announced
-    # The messages are counted somewhere.
-    assert link["rejected"]["too many frames"] + link["queue"]["dropped"] * 5_000 + 500 >= 1_000_000
-    assert messages_counted(link) >= 200 * 62
-    assert after["megabytes"] - before["megabytes"] < 150

@@ -73,15 +73,6 @@ def test_with_loss_nothing_older_comes_and_in_the_end_all_agree_on_what_is_stati
         model.check_all_agree()
 
 
-@given(graph=LOSSY, steps=steps_of("part", "part", "meet"), drop_lost=st.booleans())
-@settings(suppress_health_check=[HealthCheck.too_slow])
-def test_when_peers_are_lost_and_found_all_agree_in_the_end_whether_their_frames_leave_or_not(
-    graph: Graph, steps: list[Step], drop_lost: bool
-) -> None:
-    with Network(graph, drop_lost) as net:
-        Model(net).live(steps)
-
-
 @given(
     graph=LOSSY,
     steps=steps_of("part", "part", "meet", "overtake", "drop", "repeat", "join", "freeze", "expel", "contend"),

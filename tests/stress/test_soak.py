@@ -1,211 +1,308 @@
-"""Everything at once and at random, for a while: nothing is left behind, and the books balance all the way."""
+"""Everything at once and at random, for a while: nothing is left behind, and the counters agree all the way.
 
+Every actor does one kind of thing, with random numbers and at moments of its own. Time is simulated, so the same seed
+tells nearly the same story again.
+"""
+
+import threading
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
+from contextlib import suppress
+from functools import partial
 from random import Random
+from typing import Any
 
 import anyio
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
-from support.crowd import FRAMES, Crowd, Ending, ask, filter_messages, watch
+from anyio.abc import TaskGroup
+from support.asking import Asked
+from support.samples import moving
 
 from tfbus import (
+    LATEST,
+    SECOND,
     AheadError,
-    AuthorityConflict,
     Buffer,
+    Bus,
     BusClosedError,
     ClockReset,
     ClockResetError,
-    FrameLive,
-    FrameRemoved,
-    FrameStale,
+    Event,
     GapError,
-    KindChanged,
+    Hold,
+    InvalidTransformError,
     LookupTimeoutError,
     PastExtrapolationError,
-    Reparented,
     SampleRejected,
+    SimulatedClock,
     SubscriberFailed,
+    Transform,
+    TransformBroadcaster,
+    TransformStamped,
     UnknownFrameError,
+    from_seconds,
 )
+from tfbus.bus.queues import Overflow
+from tfbus.geometry.stamped import Batch
 from tfbus.testing import simulate
 
-Run = Callable[[Callable[[], Awaitable[None]]], None]
+Actor = Callable[[Random], Awaitable[None]]
 
-ENDINGS: tuple[Ending, ...] = ("the bus closes", "all is cancelled", "buffers close one by one")
-USUAL = (LookupTimeoutError, PastExtrapolationError, GapError, BusClosedError, ClockResetError, UnknownFrameError)
-DOCUMENTED = (*USUAL, AheadError)
+DURATION = 6.0
+USUAL = {"odom": "map", "base": "odom", "arm": "base", "hand": "arm", "tool": "hand", "lidar": "base", "echo": "base"}
+FRAMES = ("map", *USUAL)
+ENDINGS = ("the bus closes", "all is cancelled", "buffers close one by one")
+USUAL_ERRORS = (LookupTimeoutError, PastExtrapolationError, GapError, BusClosedError, ClockResetError)
+DOCUMENTED = (*USUAL_ERRORS, AheadError)
 """The ends of a lookup other than an answer; the last one is rare."""
-
 MET = {
     "answered",
-    "cancelled",
-    *(error.__name__ for error in USUAL),
-    *("watched", "watch reset", "source failed", "delivered", "removed", "owned"),
-    *("too old", "queue full", "timed out", "unknown frame", "clock reset", "closed"),
+    *(error.__name__ for error in USUAL_ERRORS),
     *("cycle", "reserved", "not a sample"),
-    *("AuthorityConflict", "ClockReset", "SubscriberFailed", "FrameRemoved", "Reparented", "KindChanged"),
-    *("FrameStale", "FrameLive"),
 }
-"""The events that a few soaks meet between them; without them there would be nothing to see."""
+"""What the soaks meet between them; without it there would be nothing to see."""
 
 
-async def audit(crowd: Crowd) -> None:
-    """Check all books at many moments, until all is over."""
-    rng = Random(crowd.seed)
-    while True:
-        await crowd.pause(rng, 0.5)
-        check_books(crowd)
+class Soak:
+    """One bus, and everybody who uses it until it ends."""
 
+    def __init__(self, seed: int, ending: str) -> None:
+        self.seed = seed
+        self.ending = ending
+        self.clock = SimulatedClock(1_000 * SECOND)
+        self.bus = Bus(self.clock, on_conflict="reject" if seed % 3 == 2 else "last")
+        self.buffers = [Buffer(self.bus), Buffer(self.bus, keep=2.0), Buffer(self.bus, prefix="robot/", shared={"map"})]
+        self.thread = self.bus.threadsafe(capacity=6)
+        self.over = False
+        self.attempted = self.accepted = self.raised = 0
+        self.met: Counter[str] = Counter()
+        self.asked: list[Asked[TransformStamped]] = []
+        self.events = self.bus.events(capacity=1_000_000, stale_after=0.3)
+        self.bus.subscribe(self.hear)
 
-def check_books(crowd: Crowd) -> None:
-    """The invariants of every moment."""
-    counted = crowd.bus.statistics()
-    for its in counted.buffers:
-        assert its.offered == its.inserted + its.replaced + its.expired
-    assert counted.samples == crowd.accepted
-    assert len(crowd.thread.queue) == 0, "what another thread has handed over is published at once"
-    # An edge that went to make room for a protected frame had been accepted.
-    judged = counted.samples + sum(counted.rejected.values()) - counted.rejected.get("displaced", 0)
-    assert crowd.attempted == judged + crowd.thread.queue.dropped
-    assert counted.callbacks_failed == crowd.raised
-    for ledger in crowd.ledgers:
-        ledger.check()
-    for pairs in crowd.filters:
-        assert pairs.arrived == pairs.delivered + sum(pairs.dropped.values()) + pairs.pending
-    if crowd.twin is not None:
-        assert crowd.twin.tree.edges() == crowd.plain.tree.edges(), "as if it had been there all along"
-    for buffer in crowd.buffers:
-        assert buffer.describe()
-        assert str(buffer.explain("map", "hand"))
-
-
-def check_lookups(crowd: Crowd) -> None:
-    """Every lookup has ended in an answer or one of the documented errors, or was cancelled."""
-    for asked in crowd.asked:
-        if isinstance(asked.error, UnknownFrameError):
-            assert asked.error.frame.startswith("/"), "any other name may still come"
-        if asked.error is not None:
-            assert isinstance(asked.error, DOCUMENTED), repr(asked.error)
-            crowd.met[type(asked.error).__name__] += 1
-        elif asked.cancelled or not asked.ended:
-            assert asked.ended or crowd.ending == "all is cancelled"
-            crowd.met["cancelled"] += 1
-        else:
-            crowd.met["answered"] += 1
-
-
-def check_events(crowd: Crowd) -> None:
-    """The streams of events agree with the counters, and with each other."""
-    counted = crowd.bus.statistics()
-    every, some, stale = (crowd.told[events] for events in (crowd.every, crowd.some, crowd.stale))
-    told = Counter(type(event) for event in every)
-    rejected = Counter(event.reason for event in every if isinstance(event, SampleRejected))
-    assert rejected.keys() == counted.rejected.keys()
-    assert rejected <= Counter(counted.rejected), "told no more often than it was counted"
-    assert told[SubscriberFailed] == counted.callbacks_failed
-    assert told[ClockReset] == counted.clock_resets
-    for kind, number in (
-        (Reparented, counted.reparented),
-        (KindChanged, counted.kind_changes),
-        (AuthorityConflict, counted.authority_conflicts),
-    ):
-        assert told[kind] <= number
-        assert (told[kind] > 0) == (number > 0)
-    assert len(some) + crowd.some.dropped == len(every)
-    there = iter(every)
-    assert all(any(event is other for other in there) for event in some)
-    crowd.met.update(counted.rejected)
-    crowd.met.update(kind.__name__ for kind in map(type, (*every, *stale)))
-    gone: set[str] = set()
-    for event in stale:
-        if isinstance(event, FrameStale):
-            assert event.frame not in gone
-            gone.add(event.frame)
-        elif isinstance(event, FrameLive):
-            gone.remove(event.frame)
-        elif isinstance(event, FrameRemoved):
-            gone.discard(event.frame)
-        elif isinstance(event, ClockReset):
-            gone.clear()
-
-
-def check_that_nothing_is_left(crowd: Crowd) -> None:
-    """Nobody waits, and nothing remembers anybody who did."""
-    counted = crowd.bus.statistics()
-    assert counted.queues == ()
-    # One was closed on the way.
-    assert len(counted.buffers) == (0 if crowd.over else len(crowd.buffers) - 1)
-    for buffer in crowd.buffers:
-        check_that_nobody_waits(buffer)
-    if not crowd.bus.closed:
-        for frame in FRAMES:
-            crowd.bus.reserve(frame, "somebody else").close()
-    crowd.bus.close()
-    crowd.jumps.close()
-    # No statistics tell of these.
-    assert crowd.clock._timers == []
-    assert crowd.clock._callbacks == {}
-
-
-def check_that_nobody_waits(buffer: Buffer) -> None:
-    assert buffer.pending() == ()
-    # Nor of these.
-    live = buffer._live
-    assert live.waiting.by_frame == {}
-    assert (len(live.watching), live.watching.by_frame) == (0, {})
-    assert live._end_callbacks == {}
-
-
-async def soak(seed: int, ending: Ending) -> Crowd:
-    crowd = Crowd(seed, ending)
-    before = len(anyio.get_running_tasks())
-
-    async def run() -> None:
+    async def run(self) -> None:
+        """Let everybody loose; ends when all have ended."""
+        actors: list[Actor] = [
+            partial(self.broadcast, authority="a"),
+            partial(self.broadcast, authority="b"),
+            partial(self.broadcast, authority="robot", prefix="robot/"),
+            self.own,
+            self.own,
+            self.remove,
+            self.publish_from_thread,
+            self.jump_about,
+            self.subscribe,
+            partial(self.read, capacity=3, overflow="conflate"),
+            partial(self.read, capacity=10, overflow="drop_oldest"),
+            self.come_and_go,
+            *[self.ask] * 3,
+        ]
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(audit, crowd)
-            await crowd.run([*[ask] * 3, *[watch] * 3, *[filter_messages] * 3])
+            tasks.start_soon(self.end, tasks)
+            for place, actor in enumerate(actors):
+                tasks.start_soon(self.act, partial(actor, Random(f"{self.seed} {place}")))
+
+    async def act(self, actor: Callable[[], Awaitable[None]]) -> None:
+        with suppress(BusClosedError):
+            await actor()
+
+    async def end(self, tasks: TaskGroup) -> None:
+        for _ in range(round(DURATION / 0.25)):
+            await self.clock.sleep(0.25)
+            self.check_counters()
+        if self.ending == "the bus closes":
+            self.bus.close()
+        elif self.ending == "all is cancelled":
             tasks.cancel_scope.cancel()
+        else:
+            for buffer in self.buffers:
+                buffer.close()
+                assert buffer.pending() == ()
+                await self.clock.sleep(0.2)
+            self.over = True
 
-    await simulate(crowd.clock, run)
-    crowd.close_events()
-    assert len(anyio.get_running_tasks()) == before
-    for ledger in crowd.ledgers:
-        await ledger.check_to_the_end()
-    for events, told in crowd.told.items():
-        told += [event async for event in events]
-    check_books(crowd)
-    check_lookups(crowd)
-    check_events(crowd)
-    check_that_nothing_is_left(crowd)
-    return crowd
+    def going(self) -> bool:
+        return not self.over and not self.bus.closed
+
+    async def pause(self, rng: Random, longest: float) -> None:
+        await self.clock.sleep(rng.uniform(0.01, longest))
+
+    # Publishers
+
+    def sample(self, rng: Random, authority: str, prefix: str = "") -> TransformStamped:
+        child = rng.choice(tuple(USUAL))
+        parent = USUAL[child] if rng.random() < 0.85 else rng.choice([frame for frame in FRAMES if frame != child])
+        parent, child = (name if name == "map" else prefix + name for name in (parent, child))
+        # In steps, so that some stamps come twice.
+        now = self.clock.now() // 10_000_000 * 10_000_000
+        stamp = now - from_seconds(rng.choice((0.0, 0.0, 0.0, 0.05, 0.3, 4.0, -0.1)))
+        static = rng.random() < (0.9 if child == "lidar" else 0.03)
+        return TransformStamped(parent, child, stamp, Transform((rng.random(), 0.0, 0.0)), authority, static)
+
+    async def broadcast(self, rng: Random, authority: str, prefix: str = "") -> None:
+        while self.going():
+            batch: list[Any] = [self.sample(rng, authority, prefix) for _ in range(rng.choice((1, 1, 1, 3)))]
+            if rng.random() < 0.4:
+                batch.append("not a sample")
+            self.bus.publish(batch, invalid="drop")
+            self.attempted += len(batch)
+            await self.pause(rng, 0.1)
+
+    async def own(self, rng: Random) -> None:
+        broadcaster = TransformBroadcaster(self.bus, f"{rng.random()}")
+        while self.going():
+            await self.pause(rng, 0.5)
+            with suppress(InvalidTransformError), broadcaster.owning("tool"):
+                for _ in range(rng.randrange(5)):
+                    self.attempted += not self.bus.closed
+                    broadcaster.send("hand", "tool", Transform())
+                    await self.pause(rng, 0.2)
+
+    async def remove(self, rng: Random) -> None:
+        while self.going():
+            await self.pause(rng, 1.0)
+            with suppress(UnknownFrameError):
+                self.bus.remove_frame(rng.choice(("", "robot/")) + rng.choice(tuple(USUAL)))
+
+    async def publish_from_thread(self, rng: Random) -> None:
+        """Samples that another thread hands over while the loop stands still, so that it is the same each time."""
+        with self.thread as publish:
+            while self.going():
+                samples = [moving("base", "arm", self.clock.now(), authority="thread")] * rng.randrange(10)
+                thread = threading.Thread(target=publish_all, args=(publish, samples))
+                thread.start()
+                thread.join()
+                self.attempted += len(samples)
+                await self.pause(rng, 0.5)
+
+    async def jump_about(self, rng: Random) -> None:
+        while self.going():
+            await self.pause(rng, 2.0)
+            by = rng.choice((-20.0, -1.0, -0.001, 0.0, 0.5, 20.0))
+            self.clock.set(self.clock.now() + from_seconds(by))
+            if by < 0.0 and self.going():
+                assert [buffer.pending() for buffer in self.buffers] == [()] * len(self.buffers)
+
+    async def come_and_go(self, rng: Random) -> None:
+        await self.pause(rng, DURATION / 2)
+        self.buffers.append(Buffer(self.bus, prefill=self.buffers[0]))
+        await self.pause(rng, DURATION / 4)
+        self.buffers[1].close()
+
+    # Listeners
+
+    def hear(self, batch: Batch) -> None:
+        self.accepted += len(batch)
+        # A callback may publish.
+        if any(sample.child == "base" for sample in batch):
+            self.attempted += 1
+            self.bus.publish(moving("base", "echo", self.clock.now(), authority="echo"), invalid="drop")
+
+    async def subscribe(self, rng: Random) -> None:
+        def crash(batch: Batch) -> None:  # noqa: ARG001
+            if rng.random() < 0.1:
+                self.raised += 1
+                raise ZeroDivisionError
+
+        while self.going():
+            with self.bus.subscribe(crash), self.bus.subscribe(crash):
+                await self.pause(rng, 1.0)
+
+    async def read(self, rng: Random, capacity: int, overflow: Overflow) -> None:
+        """Read slowly; each moving sample that was published meanwhile is read, counted as lost, or still there."""
+        while self.going():
+            offered = read = 0
+
+            def offer(batch: Batch) -> None:
+                nonlocal offered
+                offered += sum(not sample.static for sample in batch)
+
+            with self.bus.stream(capacity, overflow) as stream:
+                with self.bus.subscribe(offer), self.clock.move_on_after(rng.uniform(1.0, 8.0)):
+                    async for batch in stream:
+                        read += sum(not sample.static for sample in batch)
+                        await self.pause(rng, 0.5)
+                left = offered - read - stream.dropped - stream.queue.conflated
+                assert 0 <= left <= len(stream.queue)
+
+    async def ask(self, rng: Random) -> None:
+        async with anyio.create_task_group() as tasks:
+            while self.going():
+                target, source, fixed = rng.sample(FRAMES, 3)
+                at, source_at = (self.clock.now() + from_seconds(rng.uniform(-2.0, 0.5)) for _ in range(2))
+                options = {**policy(rng), "timeout": rng.choice((None, 0.0, 0.2, 2.0))}
+                if rng.random() < 0.3:
+                    options |= {"source_at": source_at, "fixed": fixed}
+                lookup = partial(rng.choice(self.buffers).lookup, target, source, rng.choice((at, LATEST)), **options)
+                self.asked.append(Asked(tasks, lookup))
+                if rng.random() < 0.3:
+                    rng.choice(self.asked[-20:]).cancel()
+                await self.pause(rng, 0.15)
+
+    # Checks
+
+    def check_counters(self) -> None:
+        counted = self.bus.statistics()
+        for its in counted.buffers:
+            assert its.offered == its.inserted + its.replaced + its.expired
+        assert counted.samples == self.accepted
+        # An edge that went to make room for a reserved frame had been accepted.
+        judged = counted.samples + sum(counted.rejected.values()) - counted.rejected.get("displaced", 0)
+        assert self.attempted == judged + self.thread.queue.dropped
+        assert counted.callbacks_failed == self.raised
+
+    def check_lookups(self) -> None:
+        """Check that every lookup has ended in an answer or one of the documented errors, or was cancelled."""
+        for asked in self.asked:
+            if asked.error is not None:
+                assert isinstance(asked.error, DOCUMENTED), repr(asked.error)
+                self.met[type(asked.error).__name__] += 1
+            elif not asked.cancelled:
+                assert asked.ended or self.ending == "all is cancelled"
+                self.met["answered"] += asked.ended
+
+    async def check_events(self) -> None:
+        """Check that the events agree with the counters."""
+        self.events.close()
+        told: list[Event] = [event async for event in self.events]
+        counted = self.bus.statistics()
+        rejected = {event.reason for event in told if isinstance(event, SampleRejected)}
+        assert rejected == counted.rejected.keys()
+        assert sum(isinstance(event, SubscriberFailed) for event in told) == counted.callbacks_failed
+        assert sum(isinstance(event, ClockReset) for event in told) == counted.clock_resets
+        self.met.update(rejected)
+
+    def check_that_nothing_is_left(self) -> None:
+        assert self.bus.statistics().queues == ()
+        assert [buffer.pending() for buffer in self.buffers] == [()] * len(self.buffers)
+        if not self.bus.closed:
+            self.bus.reserve("tool", "somebody else").close()
+        self.bus.close()
 
 
-@pytest.mark.anyio
+def publish_all(publish: Callable[[TransformStamped], object], samples: Iterable[TransformStamped]) -> None:
+    for sample in samples:
+        publish(sample)
+
+
+def policy(rng: Random) -> dict[str, Any]:
+    kind = rng.choice(("none", "none", "tolerance", "max_gap", "extrapolate"))
+    seconds = rng.uniform(0.0, 0.4)
+    return {} if kind == "none" else {kind: Hold(seconds) if kind == "extrapolate" else seconds}
+
+
 @pytest.mark.thorough
-async def test_a_soak_leaves_nothing_behind_and_its_books_balance() -> None:
-    await soak(0, "buffers close one by one")
-
-
-@pytest.mark.thorough
 @pytest.mark.anyio
-async def test_soaks_that_end_in_every_way_meet_everything_between_them() -> None:
-    met = Counter[str]()
-    for seed, ending in enumerate(ENDINGS):
-        met.update((await soak(seed, ending)).met)
+async def test_soaks_that_end_in_every_way_leave_nothing_behind_and_meet_everything_between_them() -> None:
+    met: Counter[str] = Counter()
+    for seed, ending in enumerate(ENDINGS * 2):
+        soak = Soak(seed, ending)
+        before = len(anyio.get_running_tasks())
+        await simulate(soak.clock, soak.run)
+        assert len(anyio.get_running_tasks()) == before
+        soak.check_counters()
+        soak.check_lookups()
+        await soak.check_events()
+        soak.check_that_nothing_is_left()
+        met += soak.met
     assert met.keys() >= MET
-
-
-@pytest.mark.thorough
-@settings(
-    max_examples=3,
-    phases=(Phase.explicit, Phase.reuse, Phase.generate),
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(seed=st.integers(0, 2**32), ending=st.sampled_from(ENDINGS))
-def test_a_soak_with_any_seed_balances_its_books(run: Run, seed: int, ending: Ending) -> None:
-    async def play() -> None:
-        await soak(seed, ending)
-
-    run(play)

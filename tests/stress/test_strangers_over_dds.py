@@ -18,7 +18,8 @@ from tfbus.links.dds.dds_link import configuration
 
 pytestmark = [pytest.mark.anyio, pytest.mark.thorough]
 
-PEER = Path(__file__).parents[1] / "support" / "hostile_cyclone_peer.py"
+PEER = Path(__file__).with_name("hostile_cyclone_peer.py")
+SUPPORT = Path(__file__).parents[1] / "support"
 CASES = 1_000
 
 
@@ -34,7 +35,12 @@ async def test_whatever_a_program_sends_over_dds_the_link_goes_on_and_counts_wha
     domain = 200 + (authority is None)
     heard: set[str] = set()
     taken: list[object] = []
-    settings = {**environ, "ROS_DOMAIN_ID": f"{domain}", "CYCLONEDDS_URI": configuration("localhost", (), None)}
+    settings = {
+        **environ,
+        "ROS_DOMAIN_ID": f"{domain}",
+        "CYCLONEDDS_URI": configuration("localhost", (), None),
+        "PYTHONPATH": f"{SUPPORT}",
+    }
     with Bus(SimulatedClock(), max_ahead=None) as bus:
         bus.subscribe(lambda batch: heard.update(sample.child for sample in batch))
         link = DdsLink(

@@ -243,31 +243,6 @@ async def test_whatever_a_stranger_sends_by_any_key_all_are_served_and_the_rest_
             assert [record for record in caplog.records if record.levelname in ("ERROR", "CRITICAL")] == []
 
 
-@pytest.mark.parametrize("named", ["tcp/\ufffd:1", "quic/a:1#;;;", "serial//dev/null"])
-async def test_no_address_that_a_peer_names_ends_a_link(named: str) -> None:
-    address, domain = free_address(), new_domain()
-    told = f"tfbus/{domain}/~/@alive/{'7' * 32}/0 {named}".encode()
-
-    def introduce(query: zenoh.Query) -> None:
-        query.reply(query.key_expr, b"0", attachment=told)
-
-    with Bus() as bus:
-        async with ZenohLink(bus, domain, listen=address) as link:
-            session = await anyio.to_thread.run_sync(zenoh.open, settings([], address, {"mode": "client"}, 2.0))
-            try:
-                key = f"tfbus/{domain}/~/hears/{STRANGER}"
-                keep = [
-                    session.declare_queryable(key, zenoh.handlers.Callback(introduce, indirect=False)),
-                    session.liveliness().declare_token(f"tfbus/{domain}/~/@alive/{STRANGER}/0"),
-                ]
-                # The second answer, after 1.5 s, would have the peer dialled.
-                await until(lambda: link.statistics().rejected.get("introduction", 0) >= 4)
-                assert link.peers == (STRANGER,)
-                del keep
-            finally:
-                await anyio.to_thread.run_sync(session.close)
-
-
 async def test_a_flood_of_tokens_is_bounded_and_counted_and_a_friend_is_met_once_it_has_gone() -> None:
     address, domain = free_address(), new_domain()
     base = f"tfbus/{domain}/~"

@@ -26,20 +26,8 @@ from tfbus import (
 Run = Callable[[Callable[[], Awaitable[None]]], None]
 
 
-def make(keep: float | None) -> tuple[SimulatedClock, Bus, Buffer]:
-    clock = SimulatedClock(100 * SECOND)
-    bus = Bus(clock)
-    return clock, bus, Buffer(bus, keep)
-
-
 def x_of(answer: TransformStamped) -> float:
     return answer.transform.translation[0]
-
-
-def nothing_is_left(buffer: Buffer) -> bool:
-    """Whether no watch is registered, neither for an answer nor for the lack of one."""
-    index = buffer._live.watching
-    return buffer.pending() == () and len(index) == 0 and index.by_frame == {}
 
 
 def is_change(last: TransformStamped | None, answer: TransformStamped, threshold: float) -> bool:
@@ -119,7 +107,9 @@ def test_a_reader_gets_what_the_model_says_whatever_happens_meanwhile(
     run: Run, bursts: list[tuple[list[Step], float]], ends: list[str], threshold: float, max_rate: float | None
 ) -> None:
     async def play() -> None:
-        clock, bus, buffer = make(None)
+        clock = SimulatedClock(100 * SECOND)
+        bus = Bus(clock)
+        buffer = Buffer(bus, None)
         model = Model(ends[0], ends[1], threshold, 0.0 if max_rate is None else 1.0 / max_rate)
         watch = buffer.watch(*ends, min_translation=threshold, max_rate=max_rate)
         elapsed = 0.0
@@ -169,7 +159,7 @@ def test_a_reader_gets_what_the_model_says_whatever_happens_meanwhile(
             await clock.advance(0)
             check()
             assert asked is None
-        assert nothing_is_left(buffer)
+        assert buffer.pending() == ()
 
     run(play)
 
@@ -177,7 +167,7 @@ def test_a_reader_gets_what_the_model_says_whatever_happens_meanwhile(
 def happen(kind: str, what: Any, clock: SimulatedClock, bus: Bus, buffer: Buffer, watch: Watch, model: Model) -> None:
     """One step, for the real thing and for the model."""
     if model.closed:
-        # What is published after the end may be in the last answer, or not.
+        # The last answer may or may not have samples that come after the end.
         return
     deaf = model.ended
     if kind == "publish" and not bus.closed:

@@ -1,12 +1,22 @@
-"""Runs ``tfbus`` in the process of the test."""
+"""Runs ``tfbus`` in the process of the test, or on a terminal."""
 
+import io
+import os
+import re
+import signal
+import struct
+import subprocess
+import threading
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import anyio
 import anyio.lowlevel
 import pytest
+from support.processes import TFBUS
 
 from tfbus import SECOND, Bus, Clock, SimulatedClock
 from tfbus.testing import simulate
@@ -107,3 +117,48 @@ def check_wrong_call(done: Done, why: str) -> None:
     (line,) = done.stderr.splitlines()
     assert line.startswith("tfbus: ")
     assert why in line
+
+
+# Commands on a terminal
+
+
+class Terminal(io.StringIO):
+    """A stream that takes itself for a terminal, for a command in the process of the test."""
+
+    encoding = "utf-8"
+
+    def isatty(self) -> bool:
+        return True
+
+
+def open_terminal() -> tuple[int, int]:
+    """The two ends of a new terminal; the test is skipped where there is none."""
+    pty: Any = pytest.importorskip("pty", reason="this system has no pseudo-terminals")
+    ends: tuple[int, int] = pty.openpty()
+    return ends
+
+
+def lines_on_a_terminal(width: int, *arguments: str | Path, seconds: float | None = None) -> list[str]:
+    """The lines that ``tfbus`` draws on a terminal of some width and 40 lines, without their colours.
+
+    With `seconds`, Ctrl-C is pressed so long after the first line.
+    """
+    ours, theirs = open_terminal()
+    fcntl: Any = pytest.importorskip("fcntl", reason="this system has no pseudo-terminals")
+    termios: Any = pytest.importorskip("termios", reason="this system has no pseudo-terminals")
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, width, 0, 0))
+    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+    environment |= {"TERM": "xterm", "NO_COLOR": "1"}
+    with os.fdopen(ours, "rb", buffering=0) as terminal:
+        command = [TFBUS, *map(str, arguments)]
+        process = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=subprocess.DEVNULL, env=environment)
+        os.close(theirs)
+        received = b""
+        with process, suppress(OSError):
+            while part := terminal.read(65_536):
+                if seconds is not None and not received:
+                    threading.Timer(seconds, process.send_signal, (signal.SIGINT,)).start()
+                received += part
+    # A live drawing goes back to its first line; each drawing has lines of its own here.
+    drawn = re.sub(r"\r|\x1b\[[0-9;?]*[AHJK]", "\n", received.decode())
+    return [line for line in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", drawn).split("\n") if line]

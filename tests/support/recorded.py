@@ -109,6 +109,12 @@ def messages_in(path: Path, since: int | None = None, until: int | None = None) 
         return without_unfinished(recording.messages(since, until))
 
 
+def in_blocks(path: Path, since: int | None = None, until: int | None = None) -> list[RecordedMessage]:
+    """The same messages, as they are in the blocks of the recording."""
+    with open_recording(path) as recording:
+        return without_unfinished(message for block in recording.blocks(since, until) for message in block.messages())
+
+
 def without_unfinished(messages: Iterable[RecordedMessage]) -> list[RecordedMessage]:
     """The messages without the report that the index of their file is missing."""
     return [message for message in messages if [error.reason for error in message.errors] != ["unfinished"]]

@@ -7,7 +7,7 @@ from typing import Unpack
 from tfbus import Bus, SimulatedClock, TransformStamped
 from tfbus.links._carrier import SendReport
 from tfbus.links._endpoint import Endpoint
-from tfbus.links._receive_queue import Received
+from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros import RosOptions
 from tfbus.links.ros.ros_link import RosCarrier, RosMessage
 from tfbus.links.ros.settings import settings_of
@@ -27,6 +27,14 @@ class ListCarrier(RosCarrier):
 
     def connect(self, receive: Callable[[Received], object], report: SendReport) -> None:
         self._receive, self._report = receive, report
+
+    def hear(self, message: RosMessage, moving: bool = False) -> None:
+        """A message comes from the peer."""
+        self._receive(Received("peer", message, len(message.payload), moving=moving))
+
+    def meet(self, is_there: bool) -> None:
+        """The peer comes or goes."""
+        self._receive(Received("peer", Presence.JOINED if is_there else Presence.LEFT))
 
     async def _connect(self) -> None:
         """A list is there."""

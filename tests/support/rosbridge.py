@@ -6,13 +6,14 @@ import subprocess
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Unpack
 
 import anyio
 import anyio.abc
 import anyio.to_thread
 import cbor2
 import pytest
+from support.processes import until
 from wsproto import ConnectionType, WSConnection
 from wsproto.events import (
     AcceptConnection,
@@ -20,14 +21,18 @@ from wsproto.events import (
     CloseConnection,
     Event,
     Ping,
+    Pong,
     RejectConnection,
     Request,
     TextMessage,
 )
 from wsproto.utilities import LocalProtocolError
 
-from tfbus import TransformStamped
+from tfbus import Bus, TransformStamped
+from tfbus.links.ros import RosOptions
 from tfbus.links.ros.messages import as_mapping, decode_mapping
+from tfbus.links.rosbridge import RosbridgeLink
+from tfbus.links.rosbridge.rosbridge_link import Encoding
 from tfbus.tf_message import encode
 
 _GONE = (anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError, LocalProtocolError)
@@ -56,10 +61,18 @@ class RosbridgeServer:
     Parameters
     ----------
     encodings : collection of str
-        Those that it knows; it answers in JSON to others.
+        The server knows these, and answers in JSON to others.
 
     Attributes
     ----------
+    requests : list of dict
+        All that clients have asked for, each with the time of the loop as ``"at"``.
+    attempts : list of tuple
+        The path of each attempt to connect, and the time of the loop.
+    pongs : list of bytes
+        The answers to its pings.
+    absent, silent, only_sends : bool
+        Whether it refuses to talk, answers nothing, or sends without reading.
     refuses : set of str
         Topics that it lets nobody advertise or publish to, without a word.
     """
@@ -68,8 +81,11 @@ class RosbridgeServer:
         self.encodings = encodings
         self.clients: list[Client] = []
         self.requests: list[dict[str, Any]] = []
+        self.attempts: list[tuple[str, float]] = []
+        self.pongs: list[bytes] = []
         self.latched: dict[str, tuple[TransformStamped, ...]] = {}
         self.port = 0
+        self.absent = False
         self.silent = False
         self.only_sends = False
         self.refuses: set[str] = set()
@@ -123,14 +139,16 @@ class RosbridgeServer:
                 while True:
                     while self.only_sends:
                         await client.send(TextMessage("{}"))
-                        await anyio.sleep(0.01)
+                        await anyio.sleep(0.5)
                     client.connection.receive_data(await stream.receive())
                     for event in client.connection.events():
                         if self.silent:
                             continue
                         if isinstance(event, Request):
-                            refused = event.target == "/refused"
-                            await client.send(RejectConnection(status_code=404) if refused else AcceptConnection())
+                            self.attempts.append((event.target, anyio.current_time()))
+                            await client.send(RejectConnection(status_code=404) if self.absent else AcceptConnection())
+                        elif isinstance(event, Pong):
+                            self.pongs.append(bytes(event.payload))
                         elif isinstance(event, Ping | CloseConnection):
                             await client.send(event.response())
                         elif isinstance(event, TextMessage):
@@ -144,7 +162,7 @@ class RosbridgeServer:
             self.clients.remove(client)
 
     async def answer(self, client: Client, request: dict[str, Any]) -> None:
-        self.requests.append(request)
+        self.requests.append({**request, "at": anyio.current_time()})
         topic = request["topic"]
         if request["op"] == "subscribe":
             client.subscriptions[topic] = request["compression"]
@@ -166,6 +184,38 @@ async def rosbridge_server(encodings: tuple[str, ...] = ("cbor-raw", "cbor")) ->
         tasks.start_soon(listener.serve, server.handle)
         yield server
         tasks.cancel_scope.cancel()
+
+
+class Joined(NamedTuple):
+    """A link that has joined a server."""
+
+    server: RosbridgeServer
+    bus: Bus
+    link: RosbridgeLink
+
+    def not_sent(self) -> dict[str, int]:
+        return dict(self.link.statistics().not_sent)
+
+    def published(self, topic: str) -> list[dict[str, Any]]:
+        """The transforms that the server has got on a topic."""
+        said = [each for each in self.server.requests if each["op"] == "publish" and each["topic"] == topic]
+        return [row for each in said for row in each["msg"]["transforms"]]
+
+    def times(self, operation: str, topic: str) -> list[float]:
+        """When the server got some requests."""
+        return [each["at"] for each in self.server.requests if (each["op"], each["topic"]) == (operation, topic)]
+
+
+@asynccontextmanager
+async def joined(
+    encodings: tuple[str, ...] = ("cbor-raw", "cbor"), encoding: Encoding = "cbor", **options: Unpack[RosOptions]
+) -> AsyncIterator[Joined]:
+    """A link of a bus of its own that sends, when the server has got its requests."""
+    async with rosbridge_server(encodings) as server:
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url, encoding=encoding, **options) as link:
+                await until(lambda: len(server.operations("advertise")) == 1)
+                yield Joined(server, bus, link)
 
 
 # A client of rosbridge that is not ours: npm's roslib, in a process of its own

@@ -1,11 +1,18 @@
-"""Short ways to write samples of which only the parent, the stamp and x matter, and to ask for that x."""
+"""Short ways to write samples of which only the parent, the stamp and x matter; histories, and trees without a bus."""
 
 from collections.abc import Iterable
 from typing import Any
 
 from hypothesis import strategies as st
 
+import tfbus
 from tfbus import LATEST, Bus, FrameAdded, Latest, Transform, TransformStamped, TransformTree
+from tfbus.rows import Row
+from tfbus.tree.forest import Forest
+from tfbus.tree.history import FrameHistory
+from tfbus.tree.tree import tree_of as tree_on
+from tfbus.tree.tree import window_of
+from tfbus.waiting.live_tree import LiveTree
 
 
 def moving(parent: str, child: str, stamp: int, x: float = 0.0, authority: str = "") -> TransformStamped:
@@ -58,3 +65,48 @@ def edges_of(bus: Bus) -> list[FrameAdded]:
     """The newest edges of a bus, in the order in which their children came."""
     with bus.events() as events:
         return [event for event in iter(events.queue.get, None) if isinstance(event, FrameAdded)]
+
+
+# Histories of single frames, and live trees without a bus
+
+
+def at_x(x: float) -> Transform:
+    """A translation of `x` m along the first axis."""
+    return Transform((x, 0.0, 0.0))
+
+
+def row_of(transform: Transform) -> Row:
+    return *transform.translation, *transform.rotation
+
+
+def moving_edge(
+    parent: str, child: str, samples: Iterable[tuple[int, Transform]] = (), keep: int | None = None
+) -> FrameHistory:
+    """A moving edge with its samples, in the order of insertion; `keep` in ns."""
+    edge = FrameHistory(child, parent, static=False, keep=keep)
+    for stamp, transform in samples:
+        edge.insert(parent, stamp, row_of(transform), "")
+    return edge
+
+
+def held(history: FrameHistory) -> int:
+    """The number of samples that a history has memory for; some may have left its window."""
+    if tfbus.kernel == "python":
+        return len(history.stamps)
+    return memoryview(history.columns(0, history.count)[0]).nbytes // 64
+
+
+def static_edge(parent: str, child: str, transform: Transform, stamp: int = 0) -> FrameHistory:
+    edge = FrameHistory(child, parent, static=True, keep=None)
+    edge.insert_static(parent, stamp, row_of(transform), "")
+    return edge
+
+
+def live_tree(keep: float | None) -> LiveTree:
+    """A live tree that the test fills; `keep` in s."""
+    return LiveTree(Forest(window_of(keep)))
+
+
+def tree_over(live: LiveTree) -> TransformTree:
+    """The tree of a buffer that has this live tree."""
+    return tree_on(live.forest, None)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.histories import moving_edge, static_edge
-from support.samples import moving, static
+from support.samples import moving, moving_edge, static, static_edge
 
 from tfbus import (
     LATEST,

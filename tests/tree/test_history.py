@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.histories import held
+from support.samples import held
 
 from tfbus import Outcome
 from tfbus.rows import Row

@@ -20,7 +20,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.both_kernels import COMPILED, KERNELS, bits, needs_both, sample_class, tfbus_on
-from support.histories import row_of
+from support.samples import row_of
 from support.strategies import TODAY, transforms
 
 from tfbus import LATEST, SECOND, Hold, Transform, TransformStamped, TransformTree

@@ -113,15 +113,6 @@ def test_the_selected_frame_is_described_and_marked_in_the_tree() -> None:
     assert texts(page).tree.count("background") == 0
 
 
-def test_the_search_finds_parts_of_names_in_any_case() -> None:
-    page = Page(driven())
-    assert texts(page).matches == texts(page).frames == ("base", "lidar", "map")
-    page.search = "A"
-    assert texts(page).matches == ("base", "lidar", "map")
-    page.search = "DAR"
-    assert texts(page).matches == ("lidar",)
-
-
 def test_the_newest_events_come_first_and_the_oldest_are_forgotten() -> None:
     page = Page(driven())
     assert "none so far" in texts(page).events
@@ -178,15 +169,6 @@ def test_a_stamp_outside_of_the_span_becomes_its_nearest_end_and_playing_ends_th
     assert (line.stamp, line.playing) == (SPAN[1], False)
     line.play()
     assert (line.stamp, line.playing) == (SPAN[0], True)
-
-
-def test_live_there_is_nothing_to_play_seek_or_step() -> None:
-    line = Timeline()
-    line.play()
-    line.seek(5)
-    line.advance(1.0)
-    line.step(forest_of(tree_of(moving("map", "a", 5))), forward=True)
-    assert (line.stamp, line.playing) == (None, False)
 
 
 def test_a_step_goes_to_the_nearest_sample_of_any_frame() -> None:
@@ -343,7 +325,7 @@ def test_a_frame_without_a_pose_says_why_and_keeps_the_other_facts() -> None:
     assert selection_facts(tree, None, "a", LATEST, 0)["pose"] == "there is no fixed frame"
 
 
-# What is told of the page as a whole
+# The texts about the page as a whole
 
 
 def test_a_root_has_no_parent_and_a_stamp_ahead_of_the_clock_is_told() -> None:

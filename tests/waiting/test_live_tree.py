@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.histories import live_tree, tree_over
-from support.samples import any_samples, moving, static
+from support.samples import any_samples, live_tree, moving, static, tree_over
 
 from tfbus import (
     LATEST,

@@ -2,8 +2,7 @@ from itertools import permutations
 
 from hypothesis import given
 from hypothesis import strategies as st
-from support.histories import live_tree, tree_over
-from support.samples import any_samples, moving
+from support.samples import any_samples, live_tree, moving, tree_over
 
 from tfbus import ClockResetError, InvalidTransformError, TransformLookupError, TransformStamped, TransformTree
 from tfbus.waiting.live_tree import LiveTree

@@ -60,7 +60,7 @@ class Finding:
     unit : str
         ``"m"``, ``"s"``, ``"m/s"``, ``"rad/s"``, ``"Hz"``, or empty.
     detail : str
-        What happens, in words.
+        A text that says what happens.
     at : int or None
         The stamp of the worst case, in ns.
     """

@@ -124,8 +124,8 @@ class TransformBroadcaster:
 
         No edge of somebody else can keep them from the place that this broadcaster gives them: see `Bus.reserve`.
 
-        All samples of a frame are removed, also those that this or another authority sent before the ``with`` began. A
-        frame that was never published is left out. Once the bus is closed, nothing is removed.
+        The end removes all samples of a frame, also older ones, whichever authority sent them. It skips a frame that
+        was never published. Once the bus is closed, nothing is removed.
 
         Raises
         ------

@@ -248,7 +248,7 @@ class Bus:
         invalid : {"raise", "drop"}
             The fate of a sample that the bus refuses: raise an error and store nothing of the batch; or leave that
             sample out, count it, and log it once for each reason, frame and authority. ``"drop"`` is for programs that
-            pass on the samples of others, and for those that must not end because of the edges of others.
+            pass on the samples of others, and for programs that the edges of others must not end.
 
         Raises
         ------

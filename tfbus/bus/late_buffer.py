@@ -27,7 +27,7 @@ class LateBuffer:
     Parameters
     ----------
     live : LiveTree
-        The buffer, empty or prefilled. What contradicts the bus is removed from it.
+        The buffer, empty or prefilled. Edges in it that contradict the bus are removed.
     topology : Topology
         The newest edges of the bus.
     """

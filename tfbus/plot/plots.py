@@ -216,7 +216,7 @@ def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None) 
     reception : mapping of str to Reception
         By frame, as `read_reception` gives it; at least one.
     figure : matplotlib.figure.Figure, optional
-        Where to draw; by default a new figure, which no window shows.
+        The figure to draw in; by default a new one, which no window shows.
 
     Returns
     -------
@@ -349,7 +349,7 @@ def plot_transforms(
     sources : str
         The frames that are drawn; at least one.
     figure : matplotlib.figure.Figure, optional
-        Where to draw; by default a new figure, which no window shows.
+        The figure to draw in; by default a new one, which no window shows.
 
     Returns
     -------

@@ -309,7 +309,7 @@ class _Run:
         except MalformedMessageError:
             if not unchanged:
                 raise
-            # It is passed through as it is.
+            # The payload is copied unread.
             transforms = []
         kept = [
             (self._edits.apply(each), decoder.authority_of(place, len(transforms)))

@@ -30,7 +30,7 @@ class HeaderStamps(NamedTuple):
 
 
 def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
-    """Read the stamps of all messages on a topic, whatever they hold.
+    """Read the stamps of all messages of any type on a topic.
 
     Parameters
     ----------

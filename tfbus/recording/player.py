@@ -218,10 +218,15 @@ class Player:
         if self._playing:
             raise RuntimeError("the recording is being played already")
         self._playing = True
+        opened: list[Recording] = []
         try:
-            with await anyio.to_thread.run_sync(self._open) as recording:
-                await self._play(recording)
+            tasks = await anyio.create_task_group().__aenter__()
+            tasks.start_soon(self._open_into, opened)
+            await close_task_group(tasks)
+            await self._play(opened[0])
         finally:
+            for recording in opened:
+                recording.close()
             self._playing = False
 
     def seek(self, stamp: int) -> None:
@@ -292,6 +297,10 @@ class Player:
         else:
             self._origin = self._playhead
         self._origin_time = now
+
+    async def _open_into(self, opened: list[Recording]) -> None:
+        # A task of its own: `Task.cancel` of asyncio would end the wait for the thread and lose what it opens.
+        opened.append(await anyio.to_thread.run_sync(self._open))
 
     def _open(self) -> Recording:
         recording = open_recording(self.path, **self._chosen)

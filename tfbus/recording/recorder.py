@@ -274,7 +274,7 @@ class Recorder:
                 flush_due = anyio.current_time() + _FLUSH_PERIOD
 
     async def _write_pending(self, output: McapOutput, flush: bool) -> None:
-        # Only what is pending now, or a flush could last for ever on a busy bus.
+        # Only the samples that are pending now: on a busy bus, a flush could last for ever.
         pending = len(self._queue)
         while True:
             batches = self._queue.get_slice(_SLICE)

@@ -55,7 +55,7 @@ def save_static(path: str | os.PathLike[str], samples: Iterable[TransformStamped
 
 
 def _escaped(line: str) -> str:
-    # YAML takes the two halves of a surrogate pair, with which JSON escapes what is beyond 16 bits, for two letters.
+    # JSON escapes a letter beyond 16 bits as a surrogate pair, whose halves YAML would read as two letters.
     return "".join(c if c.isprintable() or ord(c) > 0xFFFF else f"\\u{ord(c):04x}" for c in line)
 
 

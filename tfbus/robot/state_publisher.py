@@ -31,7 +31,7 @@ class RobotStatePublisher:
     authority : str
         The sender: shown in errors and tools.
     invalid : {"raise", "drop"}
-        What to do with a frame that the bus refuses, as in `Bus.publish`.
+        The treatment of a frame that the bus refuses, as in `Bus.publish`.
 
     Raises
     ------

@@ -60,7 +60,7 @@ class View:
     buffer : Buffer
         Its history is what the page can go back to. The frames have the names of the bus.
     port : int
-        Where to serve the page: this port, or the next one that is free; 0 for any.
+        The port of the page, or the next one that is free; 0 for any.
     host : str
         The address to listen at. By default, only programs on this machine can connect; each program that can connect
         sees and controls the page.

@@ -1,4 +1,3 @@
-import json
 import os
 
 import anyio
@@ -9,8 +8,7 @@ from support.processes import free_address, new_domain, start_tfbus, until
 from support.samples import moving, static
 from support.wires import latched
 
-from tfbus import Bus, PeerLost, PeerRejected
-from tfbus.links.ros.messages import as_mapping
+from tfbus import Bus
 
 
 @pytest.mark.thorough
@@ -70,37 +68,6 @@ async def test_a_bridge_between_rosbridge_and_rmw_zenoh_tells_what_is_refused_an
                     await anyio.sleep(0.02)
             assert await anyio.to_thread.run_sync(bridge.end) == 130
             assert bridge.errors.text.count("refused what peer") == 1
-
-
-@pytest.mark.anyio
-async def test_two_links_of_a_bus_pass_on_and_tell_of_a_refused_sample_and_a_lost_peer_once() -> None:
-    pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
-    from support.rosbridge import rosbridge_server
-
-    from tfbus.links.rosbridge import RosbridgeLink
-
-    async with rosbridge_server() as one, rosbridge_server() as two:
-        with Bus() as bus, bus.events() as events:
-            async with RosbridgeLink(bus, one.url) as first, RosbridgeLink(bus, two.url) as second:
-                await until(lambda: len(one.operations("advertise")) == len(two.operations("advertise")) == 1)
-                await one.say(moving("map", "base", 5))
-                await until(lambda: "/tf" in two.operations("publish"))
-                row = as_mapping(moving("map", "base", 6))
-                row["child_frame_id"] = "map"
-                message = json.dumps({"op": "publish", "topic": "/tf", "msg": {"transforms": [row]}})
-                await two.say_anything(message, message)
-                await until(lambda: second.statistics().rejected == {"self transform": 2})
-                await two.cut()
-                await until(lambda: second.peers == ())
-                assert first.peers == (one.url,)
-                assert first.statistics().rejected == {}
-        told = [
-            (type(event), event.peer)
-            for event in iter(events.queue.get, None)
-            if isinstance(event, PeerRejected | PeerLost)
-        ]
-        assert told[:2] == [(PeerRejected, two.url), (PeerLost, two.url)]
-        assert "/tf" not in one.operations("publish"), "nothing goes back"
 
 
 def test_a_bridge_has_two_ends(tfbus: Command) -> None:

@@ -30,6 +30,7 @@ def test_errors_are_printed_with_and_without_alignment(both: tuple[Path, Path], 
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
     assert lines[0] == "map:base, not aligned: 10 poses of 10 and 10"
+    assert lines[1].split() == ["error", "unit", "rmse", "mean", "median", "std", "min", "max"]
     assert lines[2].split() == ["absolute", "translation", "m", "2", "2", "2", "0", "2", "2"]
     assert lines[7] == "map:base, aligned: 10 poses of 10 and 10"
     plain, aligned = json.loads(tfbus("compare", *both, "--pair", "map:base", "--json").stdout)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from support.commands import Command, check_wrong_call
-from support.recorded import SMALL, WRONG_IN_SMALL, Line, real, write_mcap
+from support.recorded import SMALL, WRONG_IN_SMALL, Line, write_mcap
 from support.samples import moving, static
 
 
@@ -72,24 +72,12 @@ def test_json_has_all_digits(tfbus: Command) -> None:
     assert frames["laser"]["oldest"] is None
 
 
-def test_the_date_and_the_senders_of_a_real_recording_are_shown(tfbus: Command) -> None:
-    done = tfbus("info", real("turtlesim.bag"), "--wide")
-    assert "start     1396293887.844783943 s  2014-03-31 19:24:47 UTC" in done.stdout
-    assert rows_of(done.stdout)["turtle1"] == [
-        "world", "moving", "1,344", "62.5 Hz", "21.5 s", "16.2 ms", "turtle1_tf_broadcaster"
-    ]  # fmt: skip
-
-
 def test_names_are_no_markup_and_not_cut_where_the_output_is_no_terminal(tmp_path: Path, tfbus: Command) -> None:
     long = "a_link_with_a_very_long_name_" * 10
     samples = [moving("[bold]map[/bold]", ":robot:", 1), moving(":robot:", long, 1)]
     rows = rows_of(tfbus("info", write_mcap(tmp_path / "run.mcap", [(1, "/tf", samples)]), "--wide").stdout)
     assert rows[":robot:"][0] == "[bold]map[/bold]"
     assert rows[long][0] == ":robot:"
-
-
-def test_no_line_ends_with_blanks(tfbus: Command) -> None:
-    assert all(line == line.rstrip() for line in tfbus("info", SMALL, "--wide").stdout.splitlines())
 
 
 def test_a_frame_of_both_kinds_shows_both(tmp_path: Path, tfbus: Command) -> None:

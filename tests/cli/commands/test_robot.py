@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from support import pr2
 from support.commands import START, Command, check_wrong_call, nobody
-from support.processes import free_address, new_domain, start_tfbus, until
+from support.processes import start_tfbus, until
 
 from tfbus import SECOND, Buffer, Bus, RobotModel, TransformStamped
 from tfbus.cli.commands import robot
@@ -91,7 +91,7 @@ def test_the_tree_has_frames_joints_types_and_positions(
     ("old", "new", "arguments", "line"),
     [
         ('name="swing"', 'name="s=w"', ("s=w=1",), "├── boom      s=w     revolute   1 rad"),
-        # What mimics a joint that cannot move has no position.
+        # A joint that mimics a fixed joint has no position.
         ('name="rope" type="prismatic"', 'name="rope" type="fixed"', (), "├── shadow    follow  prismatic"),
     ],
 )
@@ -135,23 +135,15 @@ def test_the_tree_of_a_pr2_has_its_83_frames(tfbus: Command) -> None:
     [
         (["elbow=1"], "'crane' has no joint 'elbow'"),
         (["ropes=1"], "'crane' has no joint 'ropes', did you mean 'rope'?"),
-        (["=1"], "'crane' has no joint ''"),
         (["swing"], "a position is NAME=NUMBER, such as elbow=0.5, not 'swing'"),
         (["swing=left"], "joint 'swing': position 'left' is not a number"),
-        (["swing="], "joint 'swing': position '' is not a number"),
         (["swing=1,2"], "joint 'swing': position '1,2' is not one number"),
         (["swing=nan"], "joint 'swing': position nan is not finite"),
-        (["rope=inf"], "joint 'rope': position inf is not finite"),
         (["screw=1"], "joint 'screw' is fixed and has no position"),
         (["swing=1", "swing=2"], "joint 'swing' has two positions"),
         (["wheels=1"], "joint 'wheels': position must be 3 numbers, got shape (1,)"),
-        (["wind=0,0,0,0,0,0,0"], "joint 'wind': rotation is the zero quaternion"),
         (["wind=0,0,0"], "joint 'wind': rotation must be 4 numbers, got shape (0,)"),
         (["--prefix", "/r1/"], "a frame name must not start with '/', got '/r1/boom': write 'r1/boom'"),
-        (["--rate", "0"], "Invalid value"),
-        (["--rate", "nan"], "Invalid value"),
-        (["--no-such-option"], "Unknown option"),
-        (["--connect", "nowhere"], "an address is like tcp/192.168.1.5:7447, not 'nowhere'"),
     ],
 )
 def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
@@ -164,16 +156,7 @@ def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
     ("content", "message"),
     [
         (None, "cannot read {path}: No such file or directory"),
-        ("", "{path}: it is not well-formed XML: no element found: line 1, column 0"),
-        (
-            CRANE.replace('name="kite"', 'name="bird"'),
-            "{path}: in <joint name=\"wind\">: child link 'kite' is not there",
-        ),
         (CRANE.replace("0 0 5", "0 0 five"), '{path}: in <joint name="swing">: origin[@xyz]: could not convert'),
-        (
-            CRANE.replace("</robot>", '<xacro:macro xmlns:xacro="http://www.ros.org/wiki/xacro" name="m"/></robot>'),
-            '{path}: in <xacro:macro name="m">: this is still to be expanded: run xacro on the file first',
-        ),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named(tmp_path: Path, content: str | None, message: str, tfbus: Command) -> None:
@@ -209,18 +192,6 @@ def test_fixed_joints_are_published_once_and_the_others_at_the_rate(crane: str, 
     assert hooks == [pytest.approx((2.0 * math.cos(0.5), 2.0 * math.sin(0.5), 3.5))]
 
 
-@pytest.mark.thorough
-def test_other_programs_receive_the_frames_of_the_robot(crane: str) -> None:
-    options = ("--domain", new_domain())
-    address = free_address()
-    with start_tfbus("robot", crane, "rope=1.5", "--listen", address, *options) as robot:
-        with start_tfbus("echo", "base", "lamp", "--json", "--connect", address, *options) as echo:
-            assert json.loads(echo.output.expect("{"))["translation"] == [0.5, 0.0, 5.0]
-        assert robot.end() == 130
-    assert robot.output.text == ""
-    assert len(robot.errors.text.splitlines()) == 1
-
-
 def test_where_the_tree_does_not_fit_types_and_joints_go_and_mimics_are_shortened(crane: str) -> None:
     model = RobotModel.from_urdf(crane)
     whole = list(tree_lines(model, model.zeros()))
@@ -238,7 +209,6 @@ def test_where_the_tree_does_not_fit_types_and_joints_go_and_mimics_are_shortene
     [
         (("elbw=1",), "the URDF comes first: tfbus robot FILE elbw=1"),
         ((ARM, "elbw=1"), "'arm' has no joint 'elbw', did you mean 'elbow_flex'?"),
-        ((ARM, "gripper=1"), "'arm' has no joint 'gripper'"),
         ((ARM, "wrist=1"), "did you mean 'wrist_flex' or 'wrist_roll'?"),
         ((ARM, "shoulderpan=1"), "did you mean 'shoulder_pan' or 'shoulder_lift'?"),
     ],

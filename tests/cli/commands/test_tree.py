@@ -1,23 +1,15 @@
 """``tfbus tree``."""
 
-import errno
 import json
 import os
-import re
 import shutil
 from pathlib import Path
 
 import pytest
 from support.commands import START, Command, check_wrong_call
-from support.processes import free_address, new_domain, start_tfbus
 from support.samples import moving, static
 
 from tfbus import SECOND, Bus
-
-TREE = r"""base_link
-├── base_laser  \d+\.\d Hz  age .+  span .+  from 'robot_tf_publisher'
-└── camera      static  from 'tfbus static'
-"""
 
 
 async def publish(bus: Bus) -> None:
@@ -84,15 +76,6 @@ def test_by_default_it_listens_for_a_second_and_json_has_each_frame_with_null_fo
     assert json.loads(done.stdout)["frames"]["laser"] == laser
 
 
-def test_it_waits_for_the_first_transform_and_ends_at_ctrl_c(tfbus: Command) -> None:
-    async def wait(bus: Bus) -> None:
-        await bus.clock.sleep(30.0)
-
-    done = tfbus.on_domain(wait, "tree")
-    assert (done.returncode, done.stdout) == (130, "")
-    assert done.stderr == "waiting for transforms on domain 'tf' …\n"
-
-
 def test_watched_it_is_printed_again_and_again(tfbus: Command) -> None:
     async def publish_for_a_second(bus: Bus) -> None:
         bus.publish(static("map", "odom"))
@@ -111,28 +94,6 @@ def test_watched_it_is_printed_again_and_again(tfbus: Command) -> None:
     documents = [json.loads(line) for line in watch("--json").splitlines()]
     assert [document["stamp"] - START for document in documents] == [0, SECOND // 2, SECOND]
     assert [len(document["frames"]) for document in documents] == [2, 2, 3]
-
-
-def test_a_file_that_cannot_be_written_is_one_line_and_status_2(tmp_path: Path, tfbus: Command) -> None:
-    nowhere = tmp_path / "nowhere" / "frames.dot"
-    check_wrong_call(
-        tfbus.on_domain(publish, "tree", "--dot", nowhere), f"cannot write {nowhere}: {os.strerror(errno.ENOENT)}"
-    )
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_it_shows_what_programs_on_the_domain_send(backend: str) -> None:
-    domain, address = new_domain(), free_address()
-    options = ("--domain", domain, "--backend", backend)
-    with start_tfbus("tree", "--duration", "1.5", "--listen", address, *options) as tree:
-        tree.errors.expect("waiting")
-        with (
-            start_tfbus("broadcast", "--connect", address, *options),
-            start_tfbus("static", "base_link", "camera", "--connect", address, *options),
-        ):
-            assert tree.wait() == 0
-    assert re.fullmatch(TREE, tree.output.text)
 
 
 def test_it_listens_until_each_frame_was_heard_twice_and_all_are_connected(tfbus: Command) -> None:

@@ -63,23 +63,6 @@ def test_without_a_broadcaster_the_lines_say_which_frame_is_missing(tfbus: Comma
     assert done.stdout.splitlines() == missing
 
 
-def test_on_the_system_clock_the_lines_have_the_time_of_the_system(tfbus: Command) -> None:
-    done = tfbus("demo", "--duration", "0.15", "--listen-rate", "20")
-    stamps = [int(seconds) for seconds in re.findall(r"^\[ INFO\] (\d+)\.\d{9}: ", done.stdout, re.MULTILINE)]
-    assert done.returncode == 0
-    assert min(stamps) > 1_700_000_000
-
-
-@pytest.mark.anyio
-async def test_the_point_follows_the_transform() -> None:
-    clock = SimulatedClock()
-    with Bus(clock) as bus, Buffer(bus) as buffer:
-        TransformBroadcaster(bus).send("base_link", "base_laser", Transform((0.0, 0.0, 5.0)))
-        lines: list[str] = []
-        await simulate(clock, lambda: tutorial.transform_points(buffer, lines=1, output=lines.append))
-    assert "base_link: (1.00, 0.20, 5.00)" in lines[0]
-
-
 @pytest.mark.anyio
 async def test_a_transform_that_the_bus_refuses_is_logged_once_and_the_next_ones_are_sent(
     caplog: pytest.LogCaptureFixture,
@@ -161,22 +144,6 @@ def test_either_program_may_be_killed_and_started_again(backend: str) -> None:
     # Neither a traceback, nor anything that zenoh prints by itself.
     assert listener.errors.text == f"{waiting}\n"
     assert set(another.errors.text.splitlines()) <= {waiting}
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("command", "number", "status"),
-    [
-        ("broadcast", signal.SIGTERM, -signal.SIGTERM),
-        ("listen", signal.SIGTERM, -signal.SIGTERM),
-        ("listen", signal.SIGINT, 130),
-    ],
-)
-def test_a_signal_ends_it_at_once_and_silently(command: str, number: signal.Signals, status: int) -> None:
-    with start_tfbus(command, "--domain", new_domain()) as program:
-        greeting = program.errors.expect("broadcasting|waiting")
-        assert program.end(number) == status
-    assert program.errors.text == f"{greeting}\n"
 
 
 @pytest.mark.thorough

@@ -52,19 +52,8 @@ def test_a_recording_is_no_live_page_and_has_the_options_of_the_command(
 
     monkeypatch.setattr(view, "View", OccupiedView)
     recording = write_mcap(tmp_path / "run.mcap", [(0, "/tf", [moving("map", "base", 5)])])
-    options = (
-        "--fixed",
-        "map",
-        "--trail",
-        "base",
-        "--rate",
-        "5",
-        "--port",
-        "8081",
-        "--origin",
-        "https://robot.example",
-    )
-    check_wrong_call(tfbus("view", recording, *options), "cannot use port 8081: in use")
+    options = "--fixed map --trail base --rate 5 --port 8081 --origin https://robot.example"
+    check_wrong_call(tfbus("view", recording, *options.split()), "cannot use port 8081: in use")
     (given,) = asked
     named = {"origins": ("https://robot.example",), "fixed": "map", "trails": ("base",), "rate": 5.0, "live": False}
     by_default = {"host": "127.0.0.1", "urdf": None, "package_paths": ()}

@@ -1,9 +1,7 @@
-""""""
-
 import struct
 from collections.abc import Mapping
+from typing import Any
 
-import anyio
 import pytest
 from support.joint_messages import joint_state
 from support.processes import until
@@ -11,11 +9,9 @@ from support.ros import ListCarrier, RosEnd, named
 from support.samples import moving, static
 
 from tfbus import Bus, PeerRejected, SimulatedClock, from_seconds
-from tfbus.links._carrier import Carrier, SendReport
-from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros import RosLink, RosOptions
 from tfbus.links.ros.ros_link import MOST_TRANSFORMS, RosMessage
-from tfbus.links.ros.settings import settings_of
+from tfbus.links.ros.settings import as_topics
 from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.anyio
@@ -30,8 +26,7 @@ async def test_a_link_to_ros_passes_on_both_ways_what_its_options_let_through() 
             bus.publish([moving("map", "base", 1), moving("map", "other", 1), static("map", "lidar")])
             bus.subscribe(heard.append)
             for name in ("base", "lidar", "other"):
-                payload = encode([moving("map", name, 9)])
-                carrier._receive(Received("peer", RosMessage(payload, static=False, authority="/n"), len(payload)))
+                carrier.hear(RosMessage(encode([moving("map", name, 9)]), static=False, authority="/n"))
             await until(lambda: link.statistics().received_messages == 3)
         assert link.statistics().queue.capacity == 7
     assert carrier.said == [(False, [("map", "base", 1)]), (True, [("map", "lidar", 0)])]
@@ -41,16 +36,19 @@ async def test_a_link_to_ros_passes_on_both_ways_what_its_options_let_through() 
 
 
 @pytest.mark.parametrize(("options", "frames"), [({}, 1), ({"drop_lost": False}, 1), ({"drop_lost": True}, 0)])
-async def test_the_frames_of_a_lost_peer_stay_unless_they_are_to_be_dropped(options: RosOptions, frames: int) -> None:
-    carrier, payload = ListCarrier(options), encode([moving("map", "base", 9)])
+async def test_the_frames_of_a_lost_peer_stay_or_are_dropped_and_come_back_as_they_were(
+    options: RosOptions, frames: int
+) -> None:
+    carrier, payload = ListCarrier(options), encode([static("map", "lidar", 2.0)])
     with Bus() as bus:
         async with RosLink(bus, "ros", carrier, **options) as link:
-            for content in (Presence.JOINED, RosMessage(payload, static=False, authority="/n")):
-                carrier._receive(Received("peer", content))
-            await until(lambda: bus.statistics().frames == 1)
-            carrier._receive(Received("peer", Presence.LEFT))
-            await until(lambda: link.peers == ())
-            assert bus.statistics().frames == frames
+            for _ in range(2):
+                carrier.meet(True)
+                carrier.hear(RosMessage(payload, static=True, authority="/n"))
+                await until(lambda: bus.statistics().frames == 1)
+                carrier.meet(False)
+                await until(lambda: link.peers == ())
+                assert bus.statistics().frames == frames
 
 
 async def test_a_large_message_is_published_in_parts_up_to_its_first_fault() -> None:
@@ -60,7 +58,7 @@ async def test_a_large_message_is_published_in_parts_up_to_its_first_fault() -> 
         bus.subscribe(heard.append)
         async with RosLink(bus, "ros", carrier) as link:
             for sent, static_topic in ((payload, False), (payload[:-1], True)):
-                carrier._receive(Received("peer", RosMessage(sent, static_topic, authority="/n"), len(sent)))
+                carrier.hear(RosMessage(sent, static_topic, authority="/n"))
             await until(lambda: link.statistics().rejected == {"truncated": 1})
             assert link.statistics().received_messages == 2
     assert [len(batch) for batch in heard] == [40] * 9
@@ -74,7 +72,7 @@ async def test_a_huge_message_of_joints_or_of_the_time_is_refused(kind: str) -> 
     content = RosMessage(b"\0\1\0\0" + bytes(2**15), static=False, authority="", **{kind: True})
     with Bus() as bus:
         async with RosLink(bus, "ros", carrier) as link:
-            carrier._receive(Received("peer", content, 2**15))
+            carrier.hear(content)
             await until(lambda: link.statistics().rejected == {"oversized": 1})
     assert taken == []
 
@@ -86,9 +84,7 @@ async def test_a_simulated_clock_follows_the_time_of_ros_and_one_jump_back_is_on
 
     def tell(second: int) -> None:
         payload = b"\0\1\0\0" + struct.pack("<iI", second, 5)
-        carrier._receive(
-            Received("clock", RosMessage(payload, static=False, authority="", clock=True), 12, moving=True)
-        )
+        carrier.hear(RosMessage(payload, static=False, authority="", clock=True), moving=True)
 
     with Bus(clock) as bus:
         async with RosLink(bus, "ros", carrier, **options) as link:
@@ -99,39 +95,61 @@ async def test_a_simulated_clock_follows_the_time_of_ros_and_one_jump_back_is_on
             assert link.statistics().rejected == {}
 
 
-def test_numbers_of_a_link_to_ros_are_checked() -> None:
-    for options in (RosOptions(capacity=0), RosOptions(max_frames=0)):
-        with pytest.raises(ValueError):
-            RosLink(Bus(), "ros", ListCarrier(), **options)
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"authority": 5}, TypeError),
+        ({"joint_states": "/joint_states"}, TypeError),
+        ({"robot_description": "/robot_description"}, TypeError),
+        ({"tf": ""}, ValueError),
+        ({"tf_static": []}, ValueError),
+        ({"tf": [5]}, TypeError),
+        ({"joint_states": print, "joint_topic": "a b"}, ValueError),
+        ({"prefix": "/r"}, ValueError),
+        ({"shared": ["map"]}, TypeError),
+        ({"capacity": 0}, ValueError),
+        ({"max_frames": 0}, ValueError),
+    ],
+)
+def test_options_that_are_not_valid_are_refused(options: Any, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        RosLink(Bus(), "ros", ListCarrier(options), **options)
 
 
-AS_A_CARRIER: type[Carrier] = ListCarrier
-"""That it fits the protocol, mypy says."""
+@pytest.mark.parametrize(
+    ("topics", "found"),
+    [("/tf", ("/tf",)), ("robot1/tf", ("/robot1/tf",)), (["/tf", "tf", "/b_2/tf"], ("/tf", "/b_2/tf"))],
+)
+def test_topics_are_one_or_several_each_once_with_a_slash_in_front(topics: Any, found: tuple[str, ...]) -> None:
+    assert as_topics(topics, "tf") == found
+
+
+@pytest.mark.parametrize("topic", ["", "/", "/tf/", "a//b", "/1tf", "/t f", "/tf\n", ["/tf", "a-b"], []])
+def test_what_cannot_be_a_topic_is_refused(topic: Any) -> None:
+    with pytest.raises(ValueError, match="topic"):
+        as_topics(topic, "tf")
 
 
 def test_what_comes_from_ros_has_the_node_as_its_authority_and_the_kind_of_its_topic() -> None:
     end = RosEnd()
     end.hear(moving("map", "base", 5, 1.0), moving("base", "arm", 6, 2.0))
     end.hear(static("map", "lidar", 3.0, stamp=7), static=True, authority="/calibration")
+    # Names of ROS 1 may have leading slashes.
+    end.hear_bytes(named(named(encode([moving("-map", "--tip", 5)]), "-map", "/map"), "--tip", "//tip"))
     assert end.heard == [
         (moving("map", "base", 5, 1.0, "/node"), moving("base", "arm", 6, 2.0, "/node")),
         (static("map", "lidar", 3.0, 7, "/calibration"),),
+        (moving("map", "tip", 5, authority="/node"),),
     ]
     end.endpoint.send()
     assert end.carrier.said == [], "nothing goes back"
-
-
-def test_the_authority_of_all_that_comes_in_may_be_given() -> None:
+    # Nor is an empty message anything.
+    end.hear()
+    assert (len(end.heard), end.endpoint.inbox.messages) == (3, 4)
+    # An authority may be given.
     end = RosEnd(authority="robot")
     end.hear(moving("map", "base", 5))
-    end.hear(static("map", "lidar"), static=True)
-    assert [batch[0].authority for batch in end.heard] == ["robot", "robot"]
-
-
-def test_leading_slashes_leave_on_the_way_in() -> None:
-    end = RosEnd()
-    end.hear_bytes(named(named(encode([moving("-map", "--base", 5)]), "-map", "/map"), "--base", "//base"))
-    assert end.heard == [(moving("map", "base", 5, authority="/node"),)]
+    assert end.heard == [(moving("map", "base", 5, authority="robot"),)]
 
 
 def test_what_the_bus_refuses_is_counted_by_reason_and_announced_once_and_the_rest_is_published() -> None:
@@ -148,14 +166,6 @@ def test_what_the_bus_refuses_is_counted_by_reason_and_announced_once_and_the_re
     assert [event.peer for event in rejected] == ["peer"] * 3
     assert getattr(rejected[0].error, "authority", "") == "/node"
     assert [[sample.child for sample in batch] for batch in end.heard] == [["b"], ["b"]]
-
-
-def test_a_message_without_a_transform_is_nothing() -> None:
-    end = RosEnd()
-    end.hear()
-    assert end.heard == []
-    assert end.endpoint.peers.rejected == {}
-    assert end.endpoint.inbox.messages == 1
 
 
 def test_moving_frames_of_a_turn_go_out_together_and_static_ones_with_all_others_that_this_link_sends() -> None:
@@ -215,19 +225,30 @@ def test_many_moving_frames_go_out_in_several_messages() -> None:
 
 def test_with_a_prefix_only_the_frames_of_that_robot_go_out_by_their_names_there() -> None:
     end = RosEnd(prefix="r1/", shared={"map"})
-    end.hear(moving("odom", "base", 1))
-    assert end.heard == [(moving("r1/odom", "r1/base", 1, authority="/node"),)]
+    end.hear(moving("odom", "base", 1), moving("map", "odom", 1))
+    named_here = moving("r1/odom", "r1/base", 1, authority="/node"), moving("map", "r1/odom", 1, authority="/node")
+    assert end.heard == [named_here]
     end.say(moving("map", "r1/odom", 2), moving("map", "r2/odom", 2), static("r1/base", "r1/lidar"))
-    end.say(moving("world", "r1/x", 3))
     end.bus.remove_frame("r2/odom")
     end.endpoint.send()
     assert end.carrier.said == [(False, [("map", "odom", 2)]), (True, [("base", "lidar", 0)])]
-    assert end.report.not_sent == {"prefix": 1}
-    end.hear(moving("odom", "r1/b", 1))
-    assert end.endpoint.peers.rejected == {"prefix": 1}
     end.bus.remove_frame("r1/lidar")
     end.endpoint.send()
     assert end.carrier.said[-1] == (True, [])
+
+
+def test_a_name_without_the_prefix_on_the_bus_or_with_it_in_ros_is_refused_and_told() -> None:
+    end = RosEnd(prefix="r1/")
+    end.say(moving("world", "r1/x", 3))
+    assert end.report.not_sent == {"prefix": 1}
+    assert "shared={'world'} lets it pass" in str(end.errors[0])
+    with end.bus.events() as events:
+        end.hear(moving("base", "r1/b", 1))
+        end.hear(moving("r1/base", "tool", 1))
+    assert end.endpoint.peers.rejected == {"prefix": 2}
+    (told,) = (event for event in iter(events.queue.get, None) if isinstance(event, PeerRejected))
+    assert told.reason == "prefix"
+    assert [getattr(told.error, name) for name in ("parent", "child", "authority")] == ["base", "r1/b", "/node"]
 
 
 def test_a_link_that_only_listens_sends_nothing() -> None:
@@ -258,44 +279,6 @@ def test_after_a_jump_back_of_the_clock_the_stamps_of_before_are_news() -> None:
         end.endpoint.clock_jumped_back()
 
 
-def test_frames_that_were_lost_with_their_peer_come_back_as_they_were() -> None:
-    end = RosEnd()
-    end.hear(static("map", "lidar", 2.0), static=True)
-    peer = end.endpoint.peers.forget("peer")
-    assert peer is not None
-    end.endpoint._relay.lose(peer, end.endpoint.outbox, drop=True)
-    assert end.bus.statistics().frames == 0
-    end.hear(static("map", "lidar", 2.0), static=True)
-    assert end.bus.statistics().frames == 1
-
-
-def test_static_frames_can_be_sent_once_more() -> None:
-    end = RosEnd()
-    end.carrier._publish_statics()
-    assert end.carrier.said == []
-    end.say(static("map", "lidar"))
-    end.carrier._publish_statics()
-    assert end.carrier.said == [(True, [("map", "lidar", 0)])] * 2
-
-
-def test_opening_gives_the_carrier_its_callbacks() -> None:
-    carrier = ListCarrier()
-    assert (carrier.id, carrier.settings.tf) == ("list", settings_of({}).tf)
-    received: list[object] = []
-    report = SendReport(print)
-    anyio.run(carrier.open, received.append, report)
-    assert (carrier._receive, carrier._report) == (received.append, report)
-
-
-def test_no_cut_message_is_published_or_raises() -> None:
-    end = RosEnd()
-    whole = encode([moving("map", "base", 5)])
-    for size in range(len(whole) - 8):
-        end.hear_bytes(whole[:size])
-    assert end.heard == []
-    assert sum(end.endpoint.peers.rejected.values()) == len(whole) - 8
-
-
 def test_positions_of_joints_are_handed_on_and_what_comes_of_that_is_counted() -> None:
     taken: list[tuple[Mapping[str, float], int]] = []
 
@@ -306,7 +289,7 @@ def test_positions_of_joints_are_handed_on_and_what_comes_of_that_is_counted() -
 
     end = RosEnd(joint_states=take)
     for payload in (joint_state(5, {"a": 0.5, "b": 1.5}), b"garbage", joint_state(6, {"broken": 1.0})):
-        end.endpoint.handle(Received("peer", RosMessage(payload, static=False, authority="", joints=True)))
+        end.carrier.hear(RosMessage(payload, static=False, authority="", joints=True))
     assert taken == [({"a": 0.5, "b": 1.5}, 5), ({"broken": 1.0}, 6)]
     assert end.endpoint.peers.rejected == {"truncated": 1, "not published": 1}
     assert end.heard == []

@@ -5,16 +5,14 @@ is a command that serves a rosbridge of ROS 1 at the port that is its last argum
 the path of robot_state_publisher, by default that of Debian's package ``ros-robot-state-publisher``.
 """
 
-import json
 import os
 import shlex
 import shutil
-import statistics
 import subprocess
 import sys
 import time
 from collections.abc import AsyncIterator, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
+from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,17 @@ import pytest
 
 pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
 
-from support.both_sides import URDF, Program, check_clock, check_command, check_description_and_joints
+from support.both_sides import (
+    SECONDS,
+    URDF,
+    Node,
+    Program,
+    check_clock,
+    check_command,
+    check_description_and_joints,
+    meet,
+    node,
+)
 from support.processes import free_ports, until
 from support.rosbridge import install_roslib, roslib_client
 from support.samples import moving, static
@@ -40,8 +48,6 @@ pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
 PEER = Path(__file__).parents[2] / "support" / "ros1_peer.py"
 MESSAGES = PEER.with_name("real_ros_messages.py")
 ROBOT = PEER.with_name("ros1_robot.py")
-SECONDS = 10.0
-MOST_FAILED = 0.01
 NEEDED = "set ROS1_PYTHON to a Python with rospy, tf2_ros, and the messages of common_msgs"
 
 
@@ -73,13 +79,9 @@ class Ros1:
     """The command of the rosbridge."""
     server: subprocess.Popen[str]
 
-    @contextmanager
-    def node(self, seconds: float, x: float = 0.5) -> Iterator[subprocess.Popen[str]]:
+    def node(self, seconds: float, x: float = 0.5) -> AbstractContextManager[Node]:
         """A node, killed at the end."""
-        command = [self.python, str(PEER), "--seconds", f"{seconds}", "--x", f"{x}"]
-        with running(command, self.environment, stdout=subprocess.PIPE) as process:
-            yield process
-            process.kill()
+        return node([self.python, str(PEER)], self.environment, seconds, x)
 
 
 @asynccontextmanager
@@ -93,11 +95,6 @@ async def robot_of(ros: Ros1, folder: Path) -> AsyncIterator[None]:
         assert await anyio.to_thread.run_sync(process.stdout.readline) == "up\n"
         yield
         process.kill()
-
-
-async def next_line(node: subprocess.Popen[str]) -> dict[str, Any]:
-    assert node.stdout is not None
-    return dict(json.loads(await anyio.to_thread.run_sync(node.stdout.readline)))
 
 
 def has_rospy(python: str, further: str = "") -> bool:
@@ -160,32 +157,8 @@ async def reachable(port: int) -> None:
 
 async def test_both_ways_with_every_answer_right(tmp_path: Path) -> None:
     async with ros1(tmp_path) as ros:
-        with Bus() as bus, Buffer(bus) as buffer:
-            program = Program(bus, buffer)
-            async with RosbridgeLink(bus, ros.url) as link, anyio.create_task_group() as tasks:
-                tasks.start_soon(program.send)
-                # It comes late, and needs our static frame.
-                with ros.node(SECONDS) as node:
-                    assert (await next_line(node))["event"] == "up"
-                    await buffer.lookup("odom", "tool", timeout=20.0)
-                    with Bus() as late_bus, Buffer(late_bus) as late:
-                        async with RosbridgeLink(late_bus, ros.url, send=False):
-                            laser = await late.lookup("base", "laser", timeout=20.0)
-                            assert laser.transform.translation == (0.5, 0.0, 0.0)
-                            await late.lookup("arm", "tool", timeout=20.0)
-                    with anyio.move_on_after(SECONDS - 4.0):
-                        await program.ask()
-                    facts = await next_line(node)
-                tasks.cancel_scope.cancel()
-    facts |= {"in_ms": statistics.median(program.latencies), "asked": program.answered + program.failed}
-    print(facts)
-    assert program.answered > 50
-    assert facts["answered"] > 300
-    assert (program.wrong, facts["wrong"]) == (0, 0)
-    assert program.failed <= MOST_FAILED * facts["asked"]
-    assert facts["failed"] <= MOST_FAILED * (facts["answered"] + facts["failed"])
-    assert link.statistics().rejected == {}
-    assert program.authorities == {"rosbridge"}
+        with Bus() as bus:
+            assert await meet(RosbridgeLink(bus, ros.url), bus, ros.node(SECONDS)) == {"rosbridge"}
 
 
 async def test_a_node_that_is_killed_is_heard_again_when_it_is_back(tmp_path: Path) -> None:
@@ -203,8 +176,8 @@ async def test_a_node_that_is_killed_is_heard_again_when_it_is_back(tmp_path: Pa
 
 async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(tmp_path: Path) -> None:
     async with ros1(tmp_path) as ros:
-        with ros.node(12.0) as node, Bus() as bus, Buffer(bus) as buffer:
-            assert (await next_line(node))["event"] == "up"
+        with ros.node(12.0) as peer, Bus() as bus, Buffer(bus) as buffer:
+            assert (await peer.next_line())["event"] == "up"
             program = Program(bus, buffer)
             for _ in range(2):
                 async with RosbridgeLink(bus, ros.url), anyio.create_task_group() as tasks:
@@ -212,7 +185,7 @@ async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(tmp_path:
                     await buffer.lookup("odom", "tool", timeout=20.0)
                     await anyio.sleep(2.0)
                     tasks.cancel_scope.cancel()
-            facts = await next_line(node)
+            facts = await peer.next_line()
     assert facts["answered"] > 50
     assert facts["wrong"] == 0
 

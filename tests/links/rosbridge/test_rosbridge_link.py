@@ -1,5 +1,6 @@
 import json
 from contextlib import AsyncExitStack
+from pathlib import Path
 from random import Random
 from typing import Any, Literal
 
@@ -7,16 +8,19 @@ import pytest
 
 pytest.importorskip("cbor2", reason='pip install "tfbus[rosbridge]"')
 
+import anyio
 import anyio.lowlevel
 import cbor2
+from support.damage import damaged
 from support.processes import until
-from support.rosbridge import rosbridge_server
+from support.rosbridge import install_roslib, joined, rosbridge_server, roslib_client
 from support.samples import moving, static
-from support.wires import latched
+from wsproto.events import TextMessage
 
-from tfbus import Buffer, Bus, PeerJoined, PeerLost, SimulatedClock
+from tfbus import Bus, PeerLost, PeerRejected, SimulatedClock
+from tfbus.links.ros import RosOptions
 from tfbus.links.ros.messages import as_mapping
-from tfbus.links.rosbridge import RosbridgeLink, rosbridge_link
+from tfbus.links.rosbridge import RosbridgeLink
 from tfbus.links.rosbridge.websocket import WebSocket
 from tfbus.tf_message import encode
 
@@ -86,57 +90,17 @@ async def test_a_client_that_wants_json_hears_the_same_topics_as_a_link(first: b
         await until(lambda: link.statistics().received_samples == 1)
 
 
-@pytest.mark.thorough
-async def test_after_a_break_the_link_is_back_with_its_static_frames_and_hears_those_of_ros() -> None:
-    async with rosbridge_server() as server:
-        server.latched["/tf_static"] = (static("map", "lidar", 2.0, 3),)
-        with Bus() as bus, bus.events() as events:
-            bus.publish(static("map", "camera"))
-            async with RosbridgeLink(bus, server.url, drop_lost=True) as link:
-                await until(lambda: len(latched(bus)) == 2)
-                await until(lambda: server.operations("publish") == ["/tf_static"])
-                await server.cut()
-                await until(lambda: link.peers == ())
-                assert set(latched(bus)) == {"camera"}
-                bus.publish(moving("map", "base", 5))
-                await until(lambda: link.peers != ())
-                await until(lambda: len(latched(bus)) == 2)
-                await until(lambda: server.operations("publish") == ["/tf_static"] * 2)
-                assert link.statistics().not_sent == {"not connected": 1}
-                bus.publish(moving("map", "base", 6))
-                await until(lambda: server.operations("publish")[-1] == "/tf")
-            told = [type(event) for event in iter(events.queue.get, None) if isinstance(event, PeerJoined | PeerLost)]
-        assert told == [PeerJoined, PeerLost, PeerJoined]
-
-
 async def test_garbage_is_counted_by_reason_and_ends_nothing() -> None:
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url) as link:
-                await until(lambda: len(server.operations("subscribe")) == 2)
-                other = {"op": "publish", "topic": "/other", "msg": {}}
-                bad = {"op": "publish", "topic": "/tf", "msg": {"transforms": [{}]}}
-                raw = {"op": "publish", "topic": "/tf", "msg": {"bytes": b"\x05\0\0\0"}}
-                await server.say_anything("nonsense", b"\xff", "[" * 10_000, json.dumps(other), json.dumps(bad))
-                await server.say_anything(cbor2.dumps(raw), json.dumps({"op": "status", "msg": "hm"}))
-                await server.say(moving("map", "base", 5))
-                await until(lambda: link.statistics().received_samples == 1)
-                assert link.statistics().rejected == {"encoding": 4, "topic": 1, "truncated": 1}
-
-
-async def test_what_a_server_says_of_itself_is_logged_in_one_line_each_and_not_without_end(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url) as link:
-                await until(lambda: len(server.operations("subscribe")) == 2)
-                texts = [f"full\n2026 CRITICAL \x1b[2J {number}" for number in range(25)]
-                await server.say_anything(*(json.dumps({"op": "status", "msg": text}) for text in texts * 2))
-                await until(lambda: link.statistics().rejected == {"status": 10})
-    said = [line for line in caplog.messages if "says: status: full" in line]
-    assert len(said) == 20
-    assert all(line.isprintable() for line in said)
+    async with joined() as (server, _, link):
+        other = {"op": "publish", "topic": "/other", "msg": {}}
+        bad = {"op": "publish", "topic": "/tf", "msg": {"transforms": [{}]}}
+        raw = {"op": "publish", "topic": "/tf", "msg": {"bytes": b"\x05\0\0\0"}}
+        no_messages = ("", "[1]", "nonsense", "5", b"\xff", b"\x05", "[" * 100_000, b"\x81" * 100_000)
+        await server.say_anything(*no_messages, json.dumps(other), json.dumps(bad), cbor2.dumps(raw))
+        await server.say_anything(json.dumps({"op": "status", "msg": "hm"}))
+        await server.say(moving("map", "base", 5))
+        await until(lambda: link.statistics().received_samples == 1)
+        assert link.statistics().rejected == {"encoding": 9, "topic": 1, "truncated": 1}
 
 
 TINY = {
@@ -149,54 +113,24 @@ TINY = {
 
 @pytest.mark.parametrize("frames", TINY)
 async def test_tens_of_thousands_of_tiny_frames_share_the_event_loop_with_others(frames: str) -> None:
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url) as link:
-                await until(lambda: len(server.operations("subscribe")) == 2)
-                count = 1 if frames == "fragments" else 20_000
-                await server.clients[0].stream.send(TINY[frames] * count + b"\x80\1x" * (frames == "fragments"))
-                turns, most, before = 0, 0, 0
-                while before < count:
-                    await anyio.lowlevel.checkpoint()
-                    statistics = link.statistics()
-                    seen = statistics.rejected.get("encoding", 0) + statistics.queue.pending
-                    turns, most, before = turns + 1, max(most, seen - before), seen
-                # In one turn, it would be all of a read.
-                assert most < 5_000
-                assert turns > 5
-                await server.say(moving("map", "base", 5))
-                await until(lambda: link.statistics().received_samples == 1)
+    async with joined() as (server, _, link):
+        count = 1 if frames == "fragments" else 20_000
+        await server.clients[0].stream.send(TINY[frames] * count + b"\x80\1x" * (frames == "fragments"))
+        turns, most, before = 0, 0, 0
+        while before < count:
+            await anyio.lowlevel.checkpoint()
+            statistics = link.statistics()
+            seen = statistics.rejected.get("encoding", 0) + statistics.queue.pending
+            turns, most, before = turns + 1, max(most, seen - before), seen
+        # In one turn, it would be all of a read.
+        assert most < 5_000
+        assert turns > 5
+        await server.say(moving("map", "base", 5))
+        await until(lambda: link.statistics().received_samples == 1)
 
 
-def mutated(random: Random, message: bytes) -> bytes:
-    """A message with some bytes changed, cut, doubled, or replaced by pieces that decoders do not like."""
-    nasty = (
-        b"\xff",
-        b"\x9b",
-        b"\xbb",
-        b"\xdb",
-        b"\xc2",
-        b"\x5f",
-        b"\xfb\x7f\xf0",
-        b"[",
-        b"{",
-        b'"',
-        b"1" * 5_000,
-        b"NaN",
-        b"1e999",
-    )
-    for _ in range(random.randint(1, 4)):
-        at, end = sorted(random.choices(range(len(message) + 1), k=2))
-        message = random.choice(
-            [
-                message[:at] + random.choice(nasty) + message[at:],
-                message[:at] + random.choice(nasty) * random.randint(1, 300) + message[end:],
-                message[:at] + random.randbytes(random.randint(1, 8)) + message[at + 1 :],
-                message[:at],
-                message[:at] + message[at:end] * 2 + message[end:],
-            ]
-        )
-    return message
+PIECES = [b"\xff", b"\x9b", b"\xbb", b"\xdb", b"\xc2", b"\x5f", b"\xfb\x7f\xf0"]
+PIECES += [b"[", b"{", b'"', b"1" * 5_000, b"NaN", b"1e999"]
 
 
 @pytest.mark.parametrize("cases", [150, pytest.param(5_000, marks=pytest.mark.thorough)])
@@ -208,155 +142,30 @@ async def test_no_damaged_message_ends_a_link_and_each_is_counted_or_heard(cases
     raw = {"op": "publish", "topic": "/tf", "msg": {"secs": 1, "nsecs": 2, "bytes": encode(samples)}}
     good = [text.encode(), cbor2.dumps(json.loads(text)), cbor2.dumps(raw)]
     heard: set[str] = set()
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            bus.subscribe(lambda batch: heard.update(sample.child for sample in batch))
-            async with RosbridgeLink(bus, server.url, max_frames=10**6) as link:
-                await until(lambda: len(server.operations("subscribe")) == 2)
-                for number in range(cases):
-                    content = mutated(random, good[number % 3])
-                    as_text = number % 3 == 0
-                    await server.say_anything(content.decode(errors="replace") if as_text else content)
-                await server.say(moving("map", "last", 5))
-                await until(lambda: "last" in heard)
-                assert len(server.operations("subscribe")) == 2, "it is the first connection"
-                counted = link.statistics()
-                assert sum(counted.rejected.values()) > 0
-                assert counted.received_messages > 0
+    async with joined(max_frames=10**6) as (server, bus, link):
+        bus.subscribe(lambda batch: heard.update(sample.child for sample in batch))
+        for number in range(cases):
+            content = damaged(random, good[number % 3], PIECES)
+            await server.say_anything(content.decode(errors="replace") if number % 3 == 0 else content)
+        await server.say(moving("map", "last", 5))
+        await until(lambda: "last" in heard)
+        assert len(server.operations("subscribe")) == 2, "it is the first connection"
+        counted = link.statistics()
+        assert sum(counted.rejected.values()) > 0
+        assert counted.received_messages > 0
 
 
 async def test_one_message_of_thousands_of_transforms_is_published_in_parts_in_its_order() -> None:
     samples = [moving("map", f"frame{number}", 5) for number in range(2_000)]
     for known in ((), ("cbor",), ("cbor", "cbor-raw")):
-        async with rosbridge_server(known) as server:
-            heard: list[Any] = []
-            with Bus() as bus:
-                bus.subscribe(heard.append)
-                async with RosbridgeLink(bus, server.url, encoding="cbor-raw") as link:
-                    await until(lambda: len(server.operations("subscribe")) == 2)
-                    await server.say(*samples)
-                    await until(lambda: link.statistics().received_samples == 2_000)
-                    assert link.statistics().received_messages == 1
+        heard: list[Any] = []
+        async with joined(known, "cbor-raw") as (server, bus, link):
+            bus.subscribe(heard.append)
+            await server.say(*samples)
+            await until(lambda: link.statistics().received_samples == 2_000)
+            assert link.statistics().received_messages == 1
             assert [sample.child for batch in heard for sample in batch] == [sample.child for sample in samples]
             assert max(map(len, heard)) <= 40
-
-
-@pytest.mark.thorough
-async def test_a_server_that_sends_and_never_reads_is_left_and_asked_again(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    for name, value in (("FIRST_PAUSE", 0.01), ("SILENCE", 0.5)):
-        monkeypatch.setattr(rosbridge_link, name, value)
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url) as link:
-                await until(lambda: len(server.operations("advertise")) == 1)
-                server.only_sends = True
-                # More than the buffers of TCP hold.
-                for stamp in range(60):
-                    bus.publish([moving("map", f"frame{number}", stamp) for number in range(1_000)])
-                    await anyio.lowlevel.checkpoint()
-                await until(lambda: "has read nothing for 0.5 s" in caplog.text)
-                server.only_sends = False
-                await until(lambda: len(server.operations("subscribe")) == 4)
-                await server.say(moving("map", "base", 5))
-                await until(lambda: link.statistics().received_samples == 1)
-
-
-@pytest.mark.thorough
-async def test_a_server_that_sends_huge_messages_is_cut_off_and_asked_again() -> None:
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url) as link:
-                await until(lambda: len(server.operations("subscribe")) == 2)
-                await server.say_anything(bytes(100_000_000))
-                await until(lambda: len(server.operations("subscribe")) == 4)
-                await server.say(moving("map", "base", 5))
-                await until(lambda: link.statistics().received_samples == 1)
-
-
-@pytest.mark.thorough
-async def test_after_a_break_ros_2_forgets_the_former_publisher_before_moving_frames_go_out_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    for name, value in (("FIRST_PAUSE", 0.01), ("LINGER_TIME", 0.2), ("ECHO_TIME", 60.0)):
-        monkeypatch.setattr(rosbridge_link, name, value)
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url, encoding="cbor-raw") as link:
-                # Nothing moves yet.
-                await until(lambda: server.operations("advertise") == ["/tf_static"])
-                bus.publish(moving("map", "base", 1))
-                # It comes back, and tells that the server is of ROS 2.
-                await until(lambda: link.statistics().duplicates == 1)
-                await server.cut()
-                await until(lambda: link.peers == ())
-                await until(lambda: link.peers != ())
-                bus.publish(moving("map", "base", 2))
-                await until(lambda: link.statistics().not_sent == {"rejoining": 1})
-                await until(lambda: server.operations("unsubscribe") == ["/tf"])
-                bus.publish(moving("map", "base", 3))
-                await until(lambda: server.operations("publish").count("/tf") == 2)
-        assert server.operations("advertise") == ["/tf_static", "/tf", "/tf_static", "/tf"]
-        assert server.operations("subscribe") == ["/tf_static", "/tf", "/tf_static", "/tf", "/tf"]
-
-
-async def test_after_a_break_moving_frames_go_out_when_those_of_ros_2_come_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (("FIRST_PAUSE", 0.01), ("LINGER_TIME", 60.0), ("ECHO_TIME", 0.0)):
-        monkeypatch.setattr(rosbridge_link, name, value)
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url, encoding="cbor-raw") as link:
-                bus.publish(moving("map", "base", 1))
-                await until(lambda: link.statistics().duplicates == 1)
-                await server.cut()
-                await until(lambda: len(server.operations("subscribe")) == 4)
-                await server.say(moving("map", "arm", 2))
-                await until(lambda: link.statistics().received_samples == 1)
-                bus.publish(moving("map", "base", 3))
-                await until(lambda: server.operations("publish").count("/tf") == 2)
-                assert server.operations("unsubscribe") == []
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(("sends", "asked"), [(False, ["/tf_static", "/tf"]), (True, ["/tf_static"])])
-async def test_while_a_lookup_waits_the_static_frames_are_asked_for_again(sends: bool, asked: list[str]) -> None:
-    async with rosbridge_server() as server:
-        with Bus() as bus, Buffer(bus) as buffer:
-            async with RosbridgeLink(bus, server.url):
-                await until(lambda: len(server.operations("subscribe")) == 2)
-                if sends:
-                    # A server that does not give it back.
-                    server.clients[0].subscriptions.pop("/tf")
-                    bus.publish(moving("map", "base", 5))
-                    await until(lambda: "/tf" in server.operations("publish"))
-                # It had come before this link did.
-                server.latched["/tf_static"] = (static("map", "lidar", 2.0, 3),)
-                found = await buffer.lookup("map", "lidar", timeout=10)
-        assert found.transform.translation == (2.0, 0.0, 0.0)
-        assert server.operations("unsubscribe") == asked
-
-
-@pytest.mark.thorough
-async def test_a_server_that_takes_nothing_costs_the_oldest_moving_samples_and_no_static_one() -> None:
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url) as link:
-                await until(lambda: len(server.operations("advertise")) == 1)
-                for stamp in range(1_500):
-                    bus.publish(moving("map", "base", stamp))
-                    # Each in a message of its own.
-                    link._endpoint.send()
-                bus.publish(static("map", "lidar"))
-                await until(lambda: "/tf_static" in server.operations("publish"))
-                await until(lambda: server.operations("publish").count("/tf") == 1_000)
-                assert link.statistics().not_sent == {"congested": 500}
-                stamps = [
-                    request["msg"]["transforms"][0]["header"]["stamp"]["nsecs"]
-                    for request in server.requests
-                    if request["op"] == "publish" and request["topic"] == "/tf"
-                ]
-                assert stamps == list(range(500, 1_500))
 
 
 async def test_a_link_that_only_listens_announces_nothing() -> None:
@@ -369,68 +178,132 @@ async def test_a_link_that_only_listens_announces_nothing() -> None:
         assert len(server.requests) == 2
 
 
-async def test_positions_of_joints_go_to_who_takes_them() -> None:
-    async with rosbridge_server() as server:
-        taken: list[Any] = []
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url, joint_states=lambda *state: taken.append(state)):
-                await until(lambda: "/joint_states" in server.operations("subscribe"))
-                assert server.clients[0].subscriptions["/joint_states"] == "none", (
-                    "ROS 1 has no arrays of strings in CBOR"
-                )
-                message = {"header": {"stamp": {"sec": 0, "nanosec": 5}}, "name": ["a"], "position": [0.5]}
-                await server.say_anything(json.dumps({"op": "publish", "topic": "/joint_states", "msg": message}))
-                await until(lambda: taken == [({"a": 0.5}, 5)])
-
-
-async def test_the_description_of_a_robot_goes_to_who_takes_it() -> None:
-    async with rosbridge_server() as server:
-        taken: list[str] = []
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url, robot_description=taken.append) as link:
-                await until(lambda: "/robot_description" in server.operations("subscribe"))
-                for data in (5, "<robot/>"):
-                    message = {"op": "publish", "topic": "/robot_description", "msg": {"data": data}}
-                    await server.say_anything(json.dumps(message))
-                await until(lambda: taken == ["<robot/>"])
-                assert link.statistics().rejected == {"encoding": 1}
-
-
-async def test_a_simulated_clock_follows_the_time_of_ros() -> None:
-    async with rosbridge_server() as server:
-        clock = SimulatedClock()
-        with Bus(clock) as bus:
-            async with RosbridgeLink(bus, server.url, clock=clock):
-                await until(lambda: "/clock" in server.operations("subscribe"))
-                message = {"clock": {"secs": 100, "nsecs": 5}}
-                await server.say_anything(json.dumps({"op": "publish", "topic": "/clock", "msg": message}))
-                await until(lambda: clock.now() == 100_000_000_005)
-
-
-@pytest.mark.parametrize("settled", [False, True])
-async def test_what_was_published_before_the_end_still_goes_out(settled: bool) -> None:
-    async with rosbridge_server() as server:
-        with Bus() as bus:
-            async with RosbridgeLink(bus, server.url):
-                # At the end, the link has not begun to write yet, or waits for something to write.
-                await until(lambda: not settled or len(server.requests) == 3)
-                bus.publish([moving("map", "base", 5), static("map", "camera")])
-            await until(lambda: sorted(server.operations("publish")) == ["/tf", "/tf_static"])
-            await until(lambda: server.clients == [])
+JOINTS = {"header": {"stamp": {"sec": 0, "nanosec": 5}}, "name": ["a"], "position": [0.5]}
 
 
 @pytest.mark.parametrize(
-    ("url", "error"), [("localhost:9090", ValueError), (9090, TypeError), ("ws://a:9090", ValueError)]
+    ("topic", "option", "message", "taken"),
+    [
+        ("/joint_states", "joint_states", JOINTS, [({"a": 0.5}, 5)]),
+        ("/robot_description", "robot_description", {"data": "<robot/>"}, [("<robot/>",)]),
+    ],
 )
-def test_arguments_that_are_not_valid_are_refused(url: Any, error: type[Exception]) -> None:
-    with pytest.raises(error):
-        RosbridgeLink(Bus(), url, tf="")
-    encoding: Any = "json"
-    with pytest.raises(ValueError, match="'cbor' or 'cbor-raw', not 'json'"):
-        RosbridgeLink(Bus(), "ws://a", encoding=encoding)
+async def test_joints_and_the_description_of_a_robot_go_to_who_takes_them(
+    topic: str, option: str, message: dict[str, Any], taken: list[Any]
+) -> None:
+    heard: list[Any] = []
+    options: Any = {option: lambda *content: heard.append(content)}
+    async with joined(**options) as (server, _, link):
+        for content in ({"data": 5}, message):
+            await server.say_anything(json.dumps({"op": "publish", "topic": topic, "msg": content}))
+        await until(lambda: heard == taken)
+        assert link.statistics().rejected == {"encoding": 1}
 
 
-async def test_a_server_that_is_not_there_is_an_os_error() -> None:
-    with Bus() as bus, pytest.raises(OSError):
-        async with RosbridgeLink(bus, "ws://127.0.0.1:1"):
-            raise AssertionError
+@pytest.mark.parametrize(("encoding", "joints"), [("cbor", "none"), ("cbor-raw", "cbor-raw")])
+async def test_what_is_latched_is_asked_for_first_and_joints_never_in_decoded_cbor_and_a_clock_follows_ros(
+    encoding: Literal["cbor", "cbor-raw"], joints: str
+) -> None:
+    clock = SimulatedClock()
+    options: RosOptions = {"joint_states": print, "robot_description": print, "clock": clock}
+    async with rosbridge_server() as server:
+        with Bus(clock) as bus:
+            async with RosbridgeLink(bus, server.url, encoding=encoding, **options):
+                message = {"op": "publish", "topic": "/clock", "msg": {"clock": {"secs": 100, "nsecs": 5}}}
+                await until(lambda: len(server.requests) == 6)
+                await server.say_anything(json.dumps(message))
+                await until(lambda: clock.now() == 100_000_000_005)
+        # A server of ROS 1 fails at the names of joints in CBOR.
+        others = {"/clock": encoding, "/robot_description": encoding, "/joint_states": joints}
+        asked = {each["topic"]: each["compression"] for each in server.requests if each["op"] == "subscribe"}
+        assert asked == {"/tf": encoding, "/tf_static": encoding, **others}
+        topics = [(each["op"], each["topic"]) for each in server.requests]
+        assert topics[:2] == [("subscribe", "/tf_static"), ("subscribe", "/tf")]
+        assert topics[5] == ("advertise", "/tf_static")
+
+
+async def test_beyond_its_capacity_a_link_drops_what_comes_again_and_nothing_that_is_latched() -> None:
+    taken: list[str] = []
+    async with joined(capacity=3, robot_description=taken.append) as (server, bus, link):
+        (client,) = server.clients
+        described = {"op": "publish", "topic": "/robot_description", "msg": {"data": "<robot/>"}}
+        news = [server.encoded("/tf", (moving("map", "base", stamp),), "none") for stamp in range(50)]
+        kept = [
+            TextMessage(json.dumps(described)),
+            server.encoded("/tf_static", (static("map", "lidar"),), "none"),
+        ]
+        messages = [*news[:25], *kept, *news[25:]]
+        # All in one read.
+        await client.stream.send(b"".join(map(client.connection.send, messages)))
+        await until(lambda: link.statistics().queue.dropped > 0)
+        await until(lambda: bus.statistics().frames == 2)
+        assert taken == ["<robot/>"]
+
+
+@pytest.mark.parametrize("when", ["at once", "settled", "cancelled"])
+async def test_what_was_published_before_the_end_still_goes_out(when: str) -> None:
+    async with rosbridge_server() as server:
+        with Bus() as bus, anyio.CancelScope() as scope:
+            async with RosbridgeLink(bus, server.url):
+                # At the end, the link has not begun to write yet, or waits for something to write.
+                await until(lambda: when == "at once" or len(server.requests) == 3)
+                bus.publish([moving("map", "base", 5), static("map", "camera")])
+                if when == "cancelled":
+                    scope.cancel()
+        await until(lambda: sorted(server.operations("publish")) == ["/tf", "/tf_static"])
+        await until(lambda: server.clients == [])
+
+
+async def test_two_links_of_a_bus_pass_on_and_tell_of_a_refused_sample_and_a_lost_peer_once() -> None:
+    async with rosbridge_server() as one, rosbridge_server() as two:
+        with Bus() as bus, bus.events() as events:
+            async with RosbridgeLink(bus, one.url) as first, RosbridgeLink(bus, two.url) as second:
+                await until(lambda: len(one.operations("advertise")) == len(two.operations("advertise")) == 1)
+                await one.say(moving("map", "base", 5))
+                await until(lambda: "/tf" in two.operations("publish"))
+                row = {**as_mapping(moving("map", "base", 6)), "child_frame_id": "map"}
+                message = json.dumps({"op": "publish", "topic": "/tf", "msg": {"transforms": [row]}})
+                await two.say_anything(message, message)
+                await until(lambda: second.statistics().rejected == {"self transform": 2})
+                await two.cut()
+                await until(lambda: second.peers == ())
+                assert first.peers == (one.url,)
+                assert first.statistics().rejected == {}
+        told = [
+            (type(event), event.peer)
+            for event in iter(events.queue.get, None)
+            if isinstance(event, PeerRejected | PeerLost)
+        ]
+        assert told[:2] == [(PeerRejected, two.url), (PeerLost, two.url)]
+        assert "/tf" not in one.operations("publish"), "nothing goes back"
+
+
+NO_URLS = ["", "localhost:9090", "http://a", "ws://", "ws://a:0", "ws://a:70000", "ws://:9090"]
+
+
+@pytest.mark.parametrize(
+    ("url", "options", "said"),
+    [
+        *((url, {}, "no URL of a websocket") for url in NO_URLS),
+        (9090, {}, "a URL must be a str, not 9090"),
+        ("ws://a:9090", {"tf": ""}, "topic"),
+        ("ws://a", {"encoding": "json"}, "'cbor' or 'cbor-raw', not 'json'"),
+    ],
+)
+def test_arguments_that_are_not_valid_are_refused(url: Any, options: Any, said: str) -> None:
+    with pytest.raises(ValueError if isinstance(url, str) else TypeError, match=said):
+        RosbridgeLink(Bus(), url, **options)
+
+
+@pytest.mark.thorough
+async def test_roslib_hears_what_a_link_publishes(tmp_path: Path) -> None:
+    install_roslib(tmp_path)
+    samples = {"/tf": moving("map", "base", 1_000_000_005, 1.5), "/tf_static": static("base", "lidar", 2.0)}
+    async with rosbridge_server() as server, roslib_client(tmp_path, server.url) as heard:
+        await until(lambda: sorted(server.operations("subscribe")) == ["/tf", "/tf_static"])
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url):
+                bus.publish(samples.values())
+                await until(lambda: len(heard) == 2)
+    said = {fact["topic"]: fact["transforms"] for fact in heard}
+    assert said == {topic: [as_mapping(sample)] for topic, sample in samples.items()}

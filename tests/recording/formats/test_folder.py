@@ -8,15 +8,22 @@ import pytest
 import zstandard
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
-from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in, without_unfinished, write_mcap
+from support.recorded import SMALL, as_ros2, batches_in, facts, in_blocks, messages_in, write_mcap
 from support.samples import moving
 
 from tfbus import RecordingError
-from tfbus.recording import RecordedMessage, open_recording
+from tfbus.recording import open_recording
 
 ZSTD = {"fmt": CompressionFormat.ZSTD}
 LINES = [(time, "/tf", [moving("odom", "base", time)]) for time in range(30)]
 EXPECTED = [(time, tuple(samples)) for time, _, samples in LINES]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with one file."""
+    write_mcap(tmp_path / "run_0.mcap", LINES)
+    return tmp_path
 
 
 @pytest.mark.parametrize("storage", StoragePlugin)
@@ -44,12 +51,6 @@ def test_what_ros_2_records_is_read_compressed_or_not(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def in_blocks(path: Path) -> list[RecordedMessage]:
-    """All messages of a recording, as they are in its blocks."""
-    with open_recording(path) as recording:
-        return [message for block in recording.blocks() for message in block.messages()]
-
-
 def test_several_files_are_one_recording_in_the_order_of_their_times(tmp_path: Path) -> None:
     # By name, 10 is before 2.
     for number, part in ((2, LINES[:10]), (10, LINES[10:25]), (11, LINES[25:])):
@@ -63,17 +64,16 @@ def test_several_files_are_one_recording_in_the_order_of_their_times(tmp_path: P
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"nonsense"])
-def test_a_file_that_cannot_be_read_is_told_and_the_others_are_read(tmp_path: Path, content: bytes) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    (tmp_path / "run_1.mcap").write_bytes(content)
-    lost, *rest = messages_in(tmp_path)
+def test_a_file_that_cannot_be_read_is_told_and_the_others_are_read(folder: Path, content: bytes) -> None:
+    (folder / "run_1.mcap").write_bytes(content)
+    lost, *rest = messages_in(folder)
     assert (lost.received, [error.reason for error in lost.errors]) == (0, ["damaged"])
     assert "run_1.mcap" in str(lost.errors[0])
     assert [(message.received, message.batch) for message in rest] == EXPECTED
-    with open_recording(tmp_path) as recording:
+    with open_recording(folder) as recording:
         assert not recording.finished
     # Told once, also where what was static before is looked for.
-    assert sum(bool(message.errors) for message in messages_in(tmp_path, since=5)) == 1
+    assert sum(bool(message.errors) for message in messages_in(folder, since=5)) == 1
 
 
 def test_what_cannot_be_read_is_told_at_the_start_of_the_recording_or_of_the_range(tmp_path: Path) -> None:
@@ -121,20 +121,18 @@ def metadata(folder: Path, *files: str, topic: str = "/tf", count: int = 0) -> N
     )
 
 
-def test_a_folder_is_what_its_metadata_name(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    write_mcap(tmp_path / "stray.mcap", LINES)
+def test_a_folder_is_what_its_metadata_name(folder: Path) -> None:
+    write_mcap(folder / "stray.mcap", LINES)
     # As old versions wrote it, with the folder before the name.
-    metadata(tmp_path, "run/run_0.mcap", count=30)
-    assert batches_in(tmp_path) == EXPECTED
-    with open_recording(tmp_path) as recording:
+    metadata(folder, "run/run_0.mcap", count=30)
+    assert batches_in(folder) == EXPECTED
+    with open_recording(folder) as recording:
         assert recording.remarks == ("stray.mcap is ignored: metadata.yaml does not name it",)
 
 
-def test_a_file_that_the_metadata_name_and_is_not_there_is_told(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    metadata(tmp_path, "run_0.mcap", "run_1.mcap", count=30)
-    lost, *rest = messages_in(tmp_path)
+def test_a_file_that_the_metadata_name_and_is_not_there_is_told(folder: Path) -> None:
+    metadata(folder, "run_0.mcap", "run_1.mcap", count=30)
+    lost, *rest = messages_in(folder)
     assert "run_1.mcap': there is no such file" in str(lost.errors[0])
     assert len(rest) == 30
 
@@ -145,20 +143,6 @@ def test_a_name_that_leads_out_of_the_folder_does_not(tmp_path: Path) -> None:
     metadata(tmp_path / "bag", "../secret.mcap")
     with pytest.raises(RecordingError, match="there is no such file"):
         open_recording(tmp_path / "bag")
-
-
-@pytest.mark.parametrize(
-    ("topic", "count", "says"),
-    [("/tf", 31, "promises 31 messages on '/tf', and 30 were found"), ("/gone", 3, "promises 3 messages on '/gone'")],
-)
-def test_what_the_metadata_promise_and_the_files_do_not_have_is_told(
-    tmp_path: Path, topic: str, count: int, says: str
-) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    metadata(tmp_path, "run_0.mcap", topic=topic, count=count)
-    *_, lost = messages_in(tmp_path)
-    assert says in str(lost.errors[0])
-    assert lost.received == 29
 
 
 def test_what_the_metadata_promise_of_topics_that_are_not_read_is_not_told(tmp_path: Path) -> None:
@@ -178,33 +162,30 @@ def test_what_the_metadata_promise_of_topics_that_are_not_read_is_not_told(tmp_p
         ("- 1", "list indices must be integers"),
     ],
 )
-def test_metadata_that_cannot_be_read_are_ignored_with_a_remark(tmp_path: Path, text: str, why: str) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    (tmp_path / "metadata.yaml").write_text(text)
-    assert batches_in(tmp_path) == EXPECTED
-    with open_recording(tmp_path) as recording:
+def test_metadata_that_cannot_be_read_are_ignored_with_a_remark(folder: Path, text: str, why: str) -> None:
+    (folder / "metadata.yaml").write_text(text)
+    assert batches_in(folder) == EXPECTED
+    with open_recording(folder) as recording:
         assert recording.remarks[0].startswith(f"metadata.yaml is ignored, as it cannot be read: {why}")
 
 
-def test_metadata_are_read_up_to_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    write_mcap(tmp_path / "stray.mcap", LINES)
-    metadata(tmp_path, "run_0.mcap", count=30)
-    size = (tmp_path / "metadata.yaml").stat().st_size
+def test_metadata_are_read_up_to_a_bound(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_mcap(folder / "stray.mcap", LINES)
+    metadata(folder, "run_0.mcap", count=30)
+    size = (folder / "metadata.yaml").stat().st_size
     why = f"it has more than {size - 1} bytes, which is the bound"
     for bound, remark in (
         (size, "stray.mcap is ignored: metadata.yaml does not name it"),
         (size - 1, f"metadata.yaml is ignored, as it cannot be read: {why}"),
     ):
         monkeypatch.setattr("tfbus.recording.formats.folder.MAX_METADATA", bound)
-        with open_recording(tmp_path) as recording:
+        with open_recording(folder) as recording:
             assert recording.remarks == (remark,)
 
 
-def test_metadata_that_promise_nothing_on_a_topic_that_no_file_has_are_kept(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "run_0.mcap", LINES)
-    metadata(tmp_path, "run_0.mcap", topic="/gone", count=0)
-    assert batches_in(tmp_path) == EXPECTED
+def test_metadata_that_promise_nothing_on_a_topic_that_no_file_has_are_kept(folder: Path) -> None:
+    metadata(folder, "run_0.mcap", topic="/gone", count=0)
+    assert batches_in(folder) == EXPECTED
 
 
 def test_without_metadata_an_uncompressed_file_hides_the_compressed_one(tmp_path: Path) -> None:
@@ -229,7 +210,7 @@ def test_a_compressed_file_unfolds_up_to_a_bound_and_nothing_of_it_stays(
     assert list(temporary.iterdir()) == []
     whole = as_ros2(SMALL, tmp_path / "whole", StoragePlugin.SQLITE3, mode=CompressionMode.FILE, **ZSTD)
     with open_recording(whole) as recording:
-        # What reads it has it open, and it has no name.
+        # The reader has it open, and it has no name.
         assert list(temporary.iterdir()) == []
         assert sum(bool(message.batch) for message in recording.messages()) > 700
 
@@ -244,26 +225,25 @@ def test_what_is_missing_of_a_file_of_which_nothing_is_read_is_told_at_its_start
 
 # One that is not finished is not packed.
 @pytest.mark.parametrize("finish", [True, False])
-def test_what_the_metadata_promise_of_a_long_file_is_held_to_what_is_read_in_blocks(
-    tmp_path: Path, finish: bool
+@pytest.mark.parametrize(
+    ("topic", "promised", "says"),
+    [
+        ("/tf", 2_000, []),
+        ("/tf", 2_003, ["promises 2,003 messages on '/tf', and 2,000 were found"]),
+        ("/gone", 7, ["promises 7 messages on '/gone'"]),
+    ],
+)
+def test_the_promises_of_the_metadata_are_compared_with_the_messages_that_are_read(
+    tmp_path: Path, finish: bool, topic: str, promised: int, says: list[str]
 ) -> None:
-    lines = [(5 + k, "/tf", [moving("odom", "base", k)]) for k in range(2_000)]
-    write_mcap(tmp_path / "run_0.mcap", lines, finish=finish)
-    for promised, lost in ((2_000, 0), (2_003, 1)):
-        metadata(tmp_path, "run_0.mcap", count=promised)
-        with open_recording(tmp_path) as recording:
-            blocks = list(recording.blocks())
-        messages = without_unfinished(message for block in blocks for message in block.messages())
-        told = [message for message in messages if message.errors]
-        assert [message.received for message in told] == [2_004] * lost
-        assert all("promises 2,003 messages on '/tf', and 2,000 were found" in str(each.errors[0]) for each in told)
-        assert [message.received for message in messages if message.batch] == [received for received, _, _ in lines]
-    metadata(tmp_path, "run_0.mcap", topic="/gone", count=7)
-    with open_recording(tmp_path) as recording:
-        # Of a range nothing can be said.
-        within = [message for block in recording.blocks(100, 200) for message in block.messages()]
-        (lost_one,) = without_unfinished(
-            message for block in recording.blocks() for message in block.messages() if message.errors
-        )
-    assert [message.received for message in within] == list(range(100, 201))
-    assert "promises 7 messages on '/gone'" in str(lost_one.errors[0])
+    write_mcap(
+        tmp_path / "run_0.mcap", [(5 + k, "/tf", [moving("odom", "base", k)]) for k in range(2_000)], finish=finish
+    )
+    metadata(tmp_path, "run_0.mcap", topic=topic, count=promised)
+    for messages in (messages_in(tmp_path), in_blocks(tmp_path)):
+        assert [message.received for message in messages if message.batch] == list(range(5, 2_005))
+        told = [(message.received, str(message.errors[0])) for message in messages if message.errors]
+        assert [received for received, _ in told] == [2_004] * len(says)
+        assert all(each in text for each, (_, text) in zip(says, told, strict=True))
+    # Of a range nothing can be said.
+    assert [message.received for message in in_blocks(tmp_path, 100, 200)] == list(range(100, 201))

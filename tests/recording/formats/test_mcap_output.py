@@ -24,11 +24,6 @@ from tfbus.stamps import SECOND
 from tfbus.tf_message import decode
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "run.mcap"
-
-
 def written(path: Path, *entries: TimedBatch) -> McapOutput:
     with closing(McapOutput(str(path), overwrite=True)) as output:
         output.write(entries)
@@ -49,8 +44,8 @@ def readable(path: Path) -> int:
     return count
 
 
-def plain(sample: TransformStamped) -> TransformStamped:
-    """As ROS knows it."""
+def as_decoded(sample: TransformStamped) -> TransformStamped:
+    """The sample that `decode` gives: a message has neither an authority nor a kind."""
     return TransformStamped(sample.parent, sample.child, sample.stamp, sample.transform)
 
 
@@ -78,17 +73,7 @@ def test_the_official_reader_reads_topics_times_and_transforms(path: Path) -> No
     kind = ("tf2_msgs/msg/TFMessage", "ros2msg", "cdr")
     assert [entry[:6] for entry in found] == [(*kind, "/tf_static", 5, 5), (*kind, "/tf", 9, 9)]
     assert decode(found[0][6]).samples == [moving("map", "c", 0, x=3.0)]
-    assert decode(found[1][6]).samples == [moving("map", "a", 3, x=0.1), plain(turned)]
-
-
-def test_a_batch_of_both_kinds_is_a_message_on_each_topic(path: Path) -> None:
-    written(path, (5, (moving("map", "a", 1), static("a", "b"), moving("a", "c", 2), static("a", "d"))))
-    with Reader(path) as reader:
-        found = {each.topic: (time, decode(raw).samples) for each, time, raw in reader.messages()}
-    assert found == {
-        "/tf_static": (5, [moving("a", "b", 0), moving("a", "d", 0)]),
-        "/tf": (5, [moving("map", "a", 1), moving("a", "c", 2)]),
-    }
+    assert decode(found[1][6]).samples == [moving("map", "a", 3, x=0.1), as_decoded(turned)]
 
 
 def test_a_child_that_changes_its_kind_within_a_batch_has_the_last_one(path: Path) -> None:
@@ -111,8 +96,8 @@ def test_transforms_come_back_bit_for_bit(tmp_path: Path, batch: list[TransformS
         for each, _, raw in reader.messages():
             found[each.topic] += map(repr, decode(raw).samples)
     # The text tells negative zeros too.
-    assert found["/tf"] == [repr(plain(sample)) for sample in batch if not sample.static]
-    assert found["/tf_static"] == [repr(plain(sample)) for sample in batch if sample.static]
+    assert found["/tf"] == [repr(as_decoded(sample)) for sample in batch if not sample.static]
+    assert found["/tf_static"] == [repr(as_decoded(sample)) for sample in batch if sample.static]
     assert output.samples == len(batch)
 
 
@@ -125,13 +110,10 @@ def test_an_instant_before_1970_is_recorded_as_1970(path: Path) -> None:
 def authorities_in(path: Path) -> list[tuple[str | None, list[str]]]:
     """For each message, what its channel tells of authorities, and the children in it."""
     with path.open("rb") as file:
-        return [
-            (
-                channel.metadata.get("tfbus.authorities"),
-                [sample.child for sample in decode(message.data).samples if sample is not None],
-            )
-            for _, channel, message in make_reader(file).iter_messages(log_time_order=False)
-        ]
+        messages = list(make_reader(file).iter_messages(log_time_order=False))
+    told = [channel.metadata.get("tfbus.authorities") for _, channel, _ in messages]
+    children = [[sample.child for sample in decode(each.data).samples if sample] for _, _, each in messages]
+    return list(zip(told, children, strict=True))
 
 
 def test_the_channel_of_a_message_has_its_authorities(path: Path) -> None:

@@ -2,36 +2,26 @@
 
 import bz2
 import io
-import re
 import tracemalloc
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
 import lz4.frame
-import numpy as np
 import pytest
 import zstandard
-from hypothesis import given
-from hypothesis import strategies as st
-from support.recorded import write_mcap
+from support.recorded import messages_in, write_mcap
 from support.samples import moving
 
-from tfbus.recording import open_recording
 from tfbus.recording.formats import storage
 from tfbus.recording.formats.storage import (
     MIB,
     Channel,
-    ChunkPlace,
-    Packed,
     StoredMessage,
     UnfoldError,
     batches,
-    in_order,
     max_unpacked,
-    merge_chunks,
-    pack,
     shortfalls,
     unfold,
     unfold_file,
@@ -48,38 +38,10 @@ def test_what_is_promised_is_compared_by_topic() -> None:
     assert "the file promises 4 messages on '/tf', and 3 were found" in str(error)
 
 
-A, B = Channel("/a", "A", "cdr"), Channel("/b", "B", "cdr")
-messages = st.lists(st.tuples(st.integers(0, 50), st.sampled_from([A, B]), st.binary(max_size=9)), max_size=20)
-
-
-def unpacked(blocks: Iterator[storage.Stored]) -> list[StoredMessage]:
-    return [stored for block in blocks for stored in (block.stored() if isinstance(block, Packed) else block)]
-
-
-@given(stored=messages, low=st.integers(0, 30), high=st.integers(20, 60))
-def test_packed_messages_are_those_that_were_packed_in_the_order_of_their_log_times(
-    stored: list[StoredMessage], low: int, high: int
-) -> None:
-    packed = pack(stored)
-    assert packed is not None
-    assert packed.stored() == stored
-    assert packed.size == len(stored)
-    assert sum(packed.counts().values()) == len(stored)
-    expected = sorted((each for each in stored if low <= each[0] <= high), key=lambda each: each[0])
-    assert unpacked(in_order(packed, low, high)) == expected
-
-
-def test_a_log_time_that_is_no_stamp_comes_last_and_one_by_one() -> None:
-    packed = pack([(5, A, b"x"), (3, B, b"y")])
-    assert packed is not None
-    wrong = Packed(packed.data, packed.channels, packed.numbers, np.array([-1, 3]), packed.starts, packed.ends)
-    assert list(in_order(wrong, 0, 9)) == [[(3, B, b"y"), (2**64 - 1, A, b"x")]]
-
-
 def test_batches_are_bounded_by_number_and_by_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(storage, "BLOCK", 3)
     monkeypatch.setattr(storage, "BLOCK_BYTES", 10)
-    stored: list[StoredMessage] = [(k, A, bytes(size)) for k, size in enumerate((1, 1, 1, 9, 1, 30, 1))]
+    stored: list[StoredMessage] = [(k, TF, bytes(size)) for k, size in enumerate((1, 1, 1, 9, 1, 30, 1))]
     assert [[len(payload) for _, _, payload in block] for block in batches(iter(stored))] == [
         [1, 1, 1],
         [9, 1],
@@ -87,48 +49,23 @@ def test_batches_are_bounded_by_number_and_by_bytes(monkeypatch: pytest.MonkeyPa
         [1],
     ]
     # Nine bytes do not fill one of ten.
-    stored = [(k, A, bytes(size)) for k, size in enumerate((9, 1, 1))]
+    stored = [(k, TF, bytes(size)) for k, size in enumerate((9, 1, 1))]
     assert [len(block) for block in batches(iter(stored))] == [2, 1]
 
 
-@pytest.mark.parametrize("span", [(None, None), (40, 90)])
-@pytest.mark.parametrize("overlap", [15, 100])
-def test_a_file_whose_chunks_overlap_is_packed_in_the_order_of_log_times(
-    tmp_path: Path, span: tuple[int | None, int | None], overlap: int
+def test_chunks_that_overlap_beyond_the_bound_are_told_once_and_read_out_of_order(
+    path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Each chunk ends behind the beginning of the next one, or of very many.
-    times = [k + (overlap if k % 10 == 9 else 0) for k in range(400)]
-    path = write_mcap(
-        tmp_path / "run.mcap", [(time, "/tf", [moving("map", "base", time)]) for time in times], chunk_size=500
-    )
-    with open_recording(path) as recording:
-        expected = list(recording.messages(*span))
-        assert [message.received for message in expected] == sorted(
-            time for time in times if (span[0] or 0) <= time <= (span[1] or 500)
-        )
-        assert [message for block in recording.blocks(*span) for message in block.messages()] == expected
-
-
-CHANNEL = Channel("/tf", "", "cdr")
-
-
-@pytest.mark.parametrize(
-    ("offsets", "blocks"),
-    # In the order of the file, the messages at 5 of the first chunk come before those of the second.
-    [((1, 2), [(1, [0, 5]), (2, [5, 9])]), ((2, 1), [(1, [0]), (2, [5, 5, 9])])],
-)
-def test_a_message_waits_for_the_next_chunk_only_if_one_of_that_may_come_before(
-    offsets: tuple[int, int], blocks: list[tuple[int, list[int]]]
-) -> None:
-    opened: list[int] = []
-
-    def read(place: ChunkPlace) -> list[StoredMessage]:
-        opened.append(place.offset)
-        return [(place.start, CHANNEL, b""), (place.end, CHANNEL, b"")]
-
-    places = [ChunkPlace(0, 5, offsets[0]), ChunkPlace(5, 9, offsets[1])]
-    found = [(len(opened), [received for received, _, _ in block]) for block in merge_chunks(places, read)]
-    assert found == blocks
+    monkeypatch.setattr(storage, "MAX_OVERLAPPING", 1_000)
+    # The first message of each chunk comes behind all others.
+    times = [k + 1_000 * (k % 5 == 0) for k in range(100)]
+    write_mcap(path, [(time, "/tf", [moving("map", "base", time)]) for time in times], chunk_size=500)
+    messages = messages_in(path)
+    told = [str(error) for message in messages for error in message.errors]
+    assert len(told) == 1
+    assert told[0].endswith("chunks of more than 1,000 bytes overlap: their messages are not in order")
+    received = [message.received for message in messages if message.batch]
+    assert sorted(received) == sorted(times) != received
 
 
 DATA = bytes(range(256)) * 256
@@ -205,23 +142,3 @@ def test_a_file_unfolds_into_another_up_to_the_bound() -> None:
 def test_a_small_file_unfolds_to_64_mib_and_a_large_one_to_100_times_its_size() -> None:
     assert max_unpacked(1) == max_unpacked(64 * MIB // 100) == 64 * MIB
     assert max_unpacked(MIB) == 100 * MIB
-
-
-def test_the_bounds_are_those_that_open_recording_tells() -> None:
-    text = " ".join((open_recording.__doc__ or "").partition("Notes")[2].split())
-    names = (
-        "MAX_MESSAGE",
-        "MAX_OTHER_MESSAGE",
-        "MAX_METADATA",
-        "MIN_UNPACKED",
-        "MAX_INDEX",
-        "MAX_DESCRIBED",
-        "MAX_OVERLAPPING",
-    )
-    assert [int(number) * 2**20 for number in re.findall(r"(\d+) MiB", text)] == [
-        getattr(storage, name) for name in names
-    ]
-    assert storage.MAX_CHUNK == storage.MAX_OTHER_MESSAGE
-    assert "a million messages" in text
-    assert storage.MAX_CHUNK_MESSAGES == 1_000_000
-    assert f"at most {storage.MAX_FACTOR} times" in text

@@ -43,10 +43,10 @@ def convert(
     further
         More recordings, and at last the new file: .mcap, .bag (ROS 1) or .db3 (ROS 2).
     since
-        Where to start: seconds from the beginning of the first recording, a stamp in seconds, or a date. The static
+        The start: seconds from the beginning of the first recording, a stamp in seconds, or a date. The static
         transforms from before come first.
     until
-        Where to stop, in the same ways.
+        The end, in the same ways.
     topics
         Write only this topic; may be given several times.
     frames

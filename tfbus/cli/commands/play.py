@@ -67,9 +67,9 @@ def play(
     loop
         Start again at the end, until Ctrl-C.
     since
-        Where to start: seconds from the beginning of the recording, a stamp in seconds, or a date.
+        The start: seconds from the beginning of the recording, a stamp in seconds, or a date.
     until
-        Where to stop, in the same ways.
+        The end, in the same ways.
     clock
         Tell the time of the recording as well: echo, tree and listen follow it, so their ages are ages of then.
     """

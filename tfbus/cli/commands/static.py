@@ -37,7 +37,7 @@ def static(
     """Publish the static transform of CHILD in PARENT, or all that a file holds, until Ctrl-C.
 
     Programs that join later receive it too. If an edge of another program is in its way, it is tried again once a
-    second. After the end, programs that have it keep it; those that join do not get it.
+    second. After the end, programs that have it keep it, and programs that join then do not get it.
 
     Example: tfbus static base_link base_laser --xyz 0.1 0 0.2 --rpy 0 0 1.5708
 

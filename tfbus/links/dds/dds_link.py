@@ -1,4 +1,15 @@
-"""A link to ROS 2 over DDS: the transforms of a ROS 2 system on a bus, and those of the bus there."""
+"""`DdsLink`: the transforms of a ROS 2 system on a bus, and those of the bus there, over DDS.
+
+Cyclone DDS has one domain of a number in a process, with one configuration. So links to the same domain share it, and
+the last of them that ends deletes it: `domain`. Each link has a participant there, with a writer for each kind of frame
+that it sends, and a reader for each topic that it hears.
+
+A thread, `ReaderThread`, takes what the readers receive. It holds a message until the name of its node is known,
+`Publishers`, and hands it to the link, which decodes it in the event loop. The event loop only writes, and a writer
+never waits for a reader that is frozen. Joining and leaving may block, so worker threads do that.
+
+A participant is a peer as long as one of its writers is matched, on any topic of transforms.
+"""
 
 import os
 import struct
@@ -31,12 +42,6 @@ from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, as_domain, settings_of
 from tfbus.tf_message import MalformedMessageError, encode
 
-# The DDS domains of this process, and their configuration.
-#
-# The library has one domain of a number in a process, with one configuration. So links to the same domain share it, and
-# the last of them that ends deletes it.
-
-
 Discovery = Literal["localhost", "subnet"]
 
 _FAST_DDS = "1.15"
@@ -51,18 +56,29 @@ _LOOPBACK = (
 )
 
 
-def configuration(discovery: Discovery, peers: Iterable[str], own: str | None) -> str:
+def configuration(discovery: Discovery | None = None, peers: Iterable[str] = (), own: str | None = None) -> str:
     """The configuration of Cyclone DDS, as its documentation describes it.
 
     Parameters
     ----------
-    discovery : {"localhost", "subnet"}
-        Where others are looked for.
+    discovery : {"localhost", "subnet"}, optional
+        Where others are looked for, by default as ``ROS_AUTOMATIC_DISCOVERY_RANGE`` says, or else this machine.
     peers : iterable of str
         Further machines to look at.
-    own : str or None
-        A configuration in place of the two, XML or the URL of a file.
+    own : str, optional
+        A configuration in place of the two, XML or the URL of a file, by default the variable ``CYCLONEDDS_URI``.
+
+    Raises
+    ------
+    ValueError
+        If the discovery is neither of the two.
     """
+    if discovery is None:
+        subnet = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "SUBNET"
+        discovery = "subnet" if subnet else "localhost"
+    if discovery not in get_args(Discovery):
+        raise ValueError(f"discovery must be 'localhost' or 'subnet', not {discovery!r}")
+    own = own or os.environ.get("CYCLONEDDS_URI") or None
     if own is not None:
         return f'{own},<CycloneDDS><Domain id="any">{_COMPATIBILITY}</Domain></CycloneDDS>'
     machines = (*(("127.0.0.1",) if discovery == "localhost" else ()), *peers)
@@ -145,7 +161,7 @@ _ANY = Qos(Policy.Reliability.BestEffort, Policy.IgnoreLocal.Participant, Policy
 
 
 class ReadingError(MalformedMessageError):
-    """Something that has kept messages from being read; it is counted as they are, but nothing in them is malformed."""
+    """An error that has kept messages from being read; it is counted like a malformed message, though none was."""
 
     def __str__(self) -> str:
         return self.detail
@@ -168,7 +184,7 @@ class DdsCarrier(RosCarrier):
         self._number = number
         self._config = config
         self._open = ExitStack()
-        self._publishers = Publishers(self._deliver, self._is_of_ros)
+        self._publishers = Publishers(self)
         self._participants: BuiltinDataReader | None = None
         self._writers: dict[int, tuple[str, str]] = {}
         self._matched: dict[int, frozenset[str]] = {}
@@ -258,7 +274,7 @@ class DdsCarrier(RosCarrier):
         if self.settings.authority is None:
             self._publishers.message(publisher, participant, message.payload, static)
         else:
-            self._deliver(participant, "", message.payload, static)
+            self.deliver(participant, "", message.payload, static)
 
     def _take_each(self, reader: DataReader[Any], take: Callable[[Any], object]) -> bool:
         """Call a function with each of some messages that wait; returns whether more may wait."""
@@ -307,7 +323,7 @@ class DdsCarrier(RosCarrier):
             self._failed(error)
             return None
 
-    def _is_of_ros(self, participant: str) -> bool:
+    def is_of_ros(self, participant: str) -> bool:
         """Whether a participant has the user data that ROS 2 gives it."""
         if self._participants is None:
             return False
@@ -357,10 +373,10 @@ class DdsCarrier(RosCarrier):
         return None if greeting is None else greeting.update(frozenset(each.key.hex for each in publications))
 
     def _failed(self, error: Exception) -> None:
-        """Count and tell what has kept messages from being read, which is none of their faults."""
+        """Count and tell an error that has kept messages from being read."""
         self._receive(Received("", ReadingError("not read", f"DDS cannot be read: {error!r}"[:200])))
 
-    def _deliver(self, participant: str, authority: str, payload: bytes, static: bool) -> None:
+    def deliver(self, participant: str, authority: str, payload: bytes, static: bool) -> None:
         self._pass_on(participant, RosMessage(payload, static, authority))
 
 
@@ -384,7 +400,7 @@ class DdsLink(RosLink):
         A configuration of Cyclone DDS in place of the two, XML or the URL of a file, by default the variable
         ``CYCLONEDDS_URI``.
     **options
-        Those that all links to ROS share: see `tfbus.links.ros.RosLink`. By default, the authority of a sample is the
+        All links to ROS share them: see `tfbus.links.ros.RosLink`. By default, the authority of a sample is the
         node that has published it, such as ``/robot_state_publisher``.
 
     Attributes
@@ -411,7 +427,7 @@ class DdsLink(RosLink):
     -----
     The qualities of service are those of tf2: all is reliable, ``/tf_static`` is transient local. A peer is a process
     with a broadcaster. Entering takes up to 1.6 s where there are ROS 2 programs, and then their frames come at once.
-    Whoever reaches the domain can publish there, and read everything.
+    Every program that reaches the domain can publish there, and read everything.
     """
 
     def __init__(
@@ -427,16 +443,5 @@ class DdsLink(RosLink):
         if isinstance(peers, str):
             raise TypeError(f"peers must be several machines, not {peers!r}")
         self.domain = as_domain(domain)
-        config = config or os.environ.get("CYCLONEDDS_URI") or None
-        carrier = DdsCarrier(
-            self.domain, configuration(_as_discovery(discovery), tuple(peers), config), settings_of(options)
-        )
+        carrier = DdsCarrier(self.domain, configuration(discovery, peers, config), settings_of(options))
         super().__init__(bus, carrier.id, carrier, **options)
-
-
-def _as_discovery(discovery: Discovery | None) -> Discovery:
-    if discovery is None:
-        return "subnet" if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "SUBNET" else "localhost"
-    if discovery not in get_args(Discovery):
-        raise ValueError(f"discovery must be 'localhost' or 'subnet', not {discovery!r}")
-    return discovery

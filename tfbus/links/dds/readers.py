@@ -1,4 +1,18 @@
-"""`Publishers`, the names of the nodes whose messages come in."""
+"""How a link hears a DDS domain: it joins so that nothing is lost, and a thread takes messages and names their nodes.
+
+As soon as a participant of Fast DDS hears of another one, it tells of its writers, and as soon as it hears of a reader,
+it sends what is latched. Cyclone DDS drops both while it does not know their sender, and Fast DDS repeats them only
+with its next heartbeat, after 3 s. So in `join`, a participant without readers makes itself heard first. When those who
+answer are known, a second one joins, to which all is told once more; and it gets its readers when it knows the writers.
+The writers of a program that comes later meet readers which are there already: `Greeting` is for these.
+
+`ReaderThread` waits for all readers in one thread, without listeners. The library calls a listener while it keeps its
+reader, and a listener in Python first waits for the interpreter lock; `DataWriter.write` keeps that lock while it
+delivers to readers of the same process. So two links of one process to one domain, and a third program, would sooner or
+later wait for each other for ever.
+
+ROS 2 tells on a topic of its own which node has which writer. `Publishers` holds messages until it has done so.
+"""
 
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
@@ -6,7 +20,7 @@ from dataclasses import dataclass, field
 from math import inf
 from threading import Lock, Thread
 from time import monotonic, sleep
-from typing import Any
+from typing import Any, Protocol
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSStatus, Entity, GuardCondition, WaitSet
@@ -16,19 +30,8 @@ from cyclonedds.qos import Policy
 from cyclonedds.sub import DataReader
 from cyclonedds.util import duration
 
-# `join`, which spares a link the seconds after which ROS 2 repeats what was lost.
-#
-# As soon as a participant of Fast DDS hears of another one, it tells of its writers, and as soon as it hears of a
-# reader, it sends what is latched. Cyclone DDS drops both while it does not know their sender, and Fast DDS repeats
-# them only with its next heartbeat, after 3 s. So a participant without readers makes itself heard first. When those
-# who answer are known, a second one joins, to which all is told once more; and it gets its readers when it knows the
-# writers.
-#
-# The writers of a program that comes later meet readers which are there already: `Greeting` is for these.
-
-
 ANSWER_TIME = 0.06
-"""s; whoever has not answered by then is met later."""
+"""s; a program that has not answered by then is met later."""
 QUIET_TIME = 0.02
 """s; if nobody else answers for so long, all have."""
 WRITERS_TIME = 1.5
@@ -39,7 +42,7 @@ _PERIOD = 0.002
 _MOST = 10_000
 _OF_ROS = b"enclave="
 _CYCLONE = "0110"
-"""The ids of whatever Cyclone DDS has made begin so; it greets until it is understood."""
+"""The ids of writers of Cyclone DDS begin so; it greets until it is understood."""
 
 
 def join(number: int, stack: ExitStack) -> DomainParticipant:
@@ -154,13 +157,6 @@ def _wait(is_true: Callable[[], bool], limit: float) -> None:
         sleep(_PERIOD)
 
 
-# `ReaderThread`, which hands on what the readers of a DDS participant receive.
-#
-# There are no listeners. The library calls one while it keeps its reader, and a listener in Python first waits for the
-# interpreter lock; `DataWriter.write` keeps that lock while it delivers to readers of the same process. So two links of
-# one process to one domain, and a third program, would sooner or later wait for each other for ever.
-
-
 _FOR_EVER = duration(infinite=True)
 RETRY = 0.05
 """s; after so long, a function that has raised is called again."""
@@ -271,9 +267,17 @@ NODE_PATIENCE = 5.0
 MOST_WAITING = 1_000
 MOST_BYTES = 2**24
 """Bytes of all messages that wait; beyond that, none of their publisher does."""
-_MOST_PUBLISHERS = 10_000
+MOST_PUBLISHERS = 10_000
 
-Deliver = Callable[[str, str, bytes, bool], object]
+
+class Hearer(Protocol):
+    """Takes messages with their names, and knows the participants."""
+
+    def deliver(self, participant: str, authority: str, payload: bytes, static: bool) -> object:
+        """Take a message, with the name of its node, or the id of its participant if it has none."""
+
+    def is_of_ros(self, participant: str) -> bool:
+        """Whether a participant, by its id, is known to be of ROS 2, and so will tell the names of its nodes."""
 
 
 @dataclass(slots=True)
@@ -293,20 +297,14 @@ class Publishers:
 
     Parameters
     ----------
-    deliver : callable
-        Called with the id of the participant, the name of the node, the payload, and whether the topic is one of static
-        frames. The name of a publisher that is no node's is the id of its participant.
-    is_of_ros : callable
-        Whether a participant, by its id, is known to be of ROS 2, and so will tell the names of its nodes.
+    hearer : Hearer
+        Takes the messages.
     now : callable
         Returns a monotonic time in s.
     """
 
-    def __init__(
-        self, deliver: Deliver, is_of_ros: Callable[[str], bool], now: Callable[[], float] = monotonic
-    ) -> None:
-        self._deliver = deliver
-        self._is_of_ros = is_of_ros
+    def __init__(self, hearer: Hearer, now: Callable[[], float] = monotonic) -> None:
+        self._hearer = hearer
         self._now = now
         self._lock = Lock()
         self._publishers: dict[str, _Publisher] = {}
@@ -319,9 +317,9 @@ class Publishers:
         with self._lock:
             known = self._publishers.get(publisher)
             if known is None:
-                if len(self._publishers) >= _MOST_PUBLISHERS:
+                if len(self._publishers) >= MOST_PUBLISHERS:
                     self._flush(self._publishers.pop(next(iter(self._publishers))))
-                patience = NODE_PATIENCE if self._is_of_ros(participant) else PATIENCE
+                patience = NODE_PATIENCE if self._hearer.is_of_ros(participant) else PATIENCE
                 known = self._publishers[publisher] = _Publisher(participant, self._now() + patience)
                 known.name = self._names.get(participant, {}).get(publisher, "")
             known.waiting.append((payload, static))
@@ -336,7 +334,7 @@ class Publishers:
             self._named += len(known) - len(self._names.pop(participant, ()))
             if known:
                 self._names[participant] = known
-            while self._named > _MOST_PUBLISHERS:
+            while self._named > MOST_PUBLISHERS:
                 self._named -= len(self._names.pop(next(iter(self._names))))
             for id_, name in known.items():
                 publisher = self._publishers.get(id_)
@@ -362,4 +360,4 @@ class Publishers:
         waiting, publisher.waiting = publisher.waiting, []
         self._bytes -= sum(len(payload) for payload, _ in waiting)
         for payload, static in waiting:
-            self._deliver(publisher.participant, publisher.name, payload, static)
+            self._hearer.deliver(publisher.participant, publisher.name, payload, static)

@@ -1,4 +1,14 @@
-"""A link to ROS 2 over zenoh: the transforms of ROS 2 programs with rmw_zenoh on a bus, and those of the bus there."""
+"""`RmwZenohLink`: the transforms of ROS 2 programs with rmw_zenoh on a bus, and those of the bus there, over zenoh.
+
+The link is a node of ROS 2 as its middleware rmw_zenoh makes one, from version 0.2.4 on. Its design document and its
+source tell how: a topic is the key ``<domain>/<topic>/<type>/<hash of the type>``; nodes, publishers and subscriptions
+are liveliness tokens under ``@ros2_lv``, in which ``%`` stands for a slash; a message goes with its number, its time,
+and the id of its publisher. The id keeps the link from hearing itself. A latched topic has a publisher with a cache,
+which zenoh's advanced subscribers ask when they come.
+
+zenoh's threads call with the messages that come, and `RosCarrier` hands them to the link. Opening and closing a session
+block, so worker threads do that.
+"""
 
 import json
 import re
@@ -23,13 +33,6 @@ from tfbus.links.zenoh._closing import begin_to_close, close_session, use_zenoh,
 from tfbus.links.zenoh._opening import directly, refusal
 from tfbus.links.zenoh._settings import without_source_location
 from tfbus.tf_message import encode
-
-# The keys and attachments of rmw_zenoh, from version 0.2.4 on.
-#
-# Its design document and its source tell them: a topic is the key ``<domain>/<topic>/<type>/<hash of the type>``;
-# nodes, publishers and subscriptions are liveliness tokens under ``@ros2_lv``, in which ``%`` stands for a slash; a
-# message goes with its number, its time, and the id of its publisher.
-
 
 TYPE: Final = "tf2_msgs::msg::dds_::TFMessage_"
 HASH: Final = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
@@ -266,7 +269,7 @@ class RmwZenohLink(RosLink):
     config : mapping of str to any, optional
         Settings of zenoh by their path, laid over those of the link, such as TLS.
     **options
-        Those that all links to ROS share: see `tfbus.links.ros.RosLink`. By default, the authority of all samples is
+        All links to ROS share them: see `tfbus.links.ros.RosLink`. By default, the authority of all samples is
         ``"rmw_zenoh"``.
 
     Attributes
@@ -293,7 +296,7 @@ class RmwZenohLink(RosLink):
     Notes
     -----
     The messages are those of rmw_zenoh 0.2.4 and later, so of ROS 2 Jazzy. Nobody is a peer, for the router tells of
-    nobody. Whoever reaches the router can publish there, and read everything.
+    nobody. Every program that reaches the router can publish there, and read everything.
     """
 
     def __init__(
@@ -311,12 +314,18 @@ class RmwZenohLink(RosLink):
         if not isinstance(node, str) or not _NODE.fullmatch(node):
             raise ValueError(f"{node!r} cannot be the name of a node: letters, digits and _")
         self.domain = as_domain(domain)
-        carrier = RmwZenohCarrier(self.domain, node, _config(router, config or {}), settings_of(options))
+        carrier = RmwZenohCarrier(self.domain, node, configuration(router, config or {}), settings_of(options))
         super().__init__(bus, carrier.id, carrier, **options)
 
 
-def _config(router: str, own: Mapping[str, Any]) -> zenoh.Config:
-    """As rmw_zenoh configures its sessions, but as a client."""
+def configuration(router: str, own: Mapping[str, Any]) -> zenoh.Config:
+    """As rmw_zenoh configures its sessions, but as a client.
+
+    Raises
+    ------
+    ValueError
+        If zenoh does not take a setting.
+    """
     config = zenoh.Config()
     values: dict[str, Any] = {
         "mode": "client",

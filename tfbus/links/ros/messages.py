@@ -1,4 +1,12 @@
-"""The message ``std_msgs/String``, in which a robot is described."""
+"""Reads transforms, the time and a text from messages of ROS, in bytes of either ROS or as mappings.
+
+Links through rosbridge get messages of ROS 1 in bytes, and messages of both in JSON or CBOR, which are mappings here.
+Links to ROS 2 get CDR: `tfbus.tf_message` reads the transforms of that, and `tfbus.robot` the positions of joints.
+
+A message of transforms of ROS 1 is their number, then for each ``uint32 seq, sec, nsec``, two strings of a length and
+UTF-8, and seven ``float64``; everything is little endian, and nothing is aligned. A transform that is not valid is an
+error beside the others. Anything else that is wrong makes the message malformed.
+"""
 
 import struct
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,16 +20,14 @@ from tfbus.links._provenance import ReceivedTransform
 from tfbus.stamps import SECOND
 from tfbus.tf_message import MAX_NAME, Decoded, MalformedMessageError
 
-# The transforms of messages that are no CDR: those of ROS 1, and those of JSON and CBOR.
-#
-# A message of ROS 1 is ``tf2_msgs/TFMessage``: the number of transforms, then for each ``uint32 seq, sec, nsec``, two
-# strings of a length and UTF-8, and seven ``float64``; everything is little endian, and nothing is aligned.
-
-
 _COUNT = struct.Struct("<I")
 _HEAD = struct.Struct("<4xII")
 _NUMBERS = struct.Struct("<7d")
 _SHORTEST = 4 + 8 + 2 * 4 + 56
+_TIME_OF_ROS1 = struct.Struct("<II")
+_TIME_OF_CDR = {b"\0\1": struct.Struct("<4xiI"), b"\0\0": struct.Struct(">4xiI")}
+_BYTE_ORDERS = {b"\0\1": "<", b"\0\0": ">"}
+_SIZE = 4
 
 _Parts = tuple[object, object, int, int, tuple[Any, ...]]
 """Parent, child, seconds, nanoseconds, and x, y, z and the quaternion (x, y, z, w)."""
@@ -152,10 +158,6 @@ def _bare(name: object) -> str | None:
         return None
 
 
-_ROS1 = struct.Struct("<II")
-_CDR = {b"\0\1": struct.Struct("<4xiI"), b"\0\0": struct.Struct(">4xiI")}
-
-
 def decode_clock(content: Any) -> int:
     """The time in ns of a message, in bytes of either ROS or as a mapping.
 
@@ -166,7 +168,7 @@ def decode_clock(content: Any) -> int:
     """
     if isinstance(content, bytes):
         # Only that of ROS 1 has no header.
-        layout = _ROS1 if len(content) == _ROS1.size else _CDR.get(content[:2])
+        layout = _TIME_OF_ROS1 if len(content) == _TIME_OF_ROS1.size else _TIME_OF_CDR.get(content[:2])
         if layout is None or len(content) < layout.size:
             raise MalformedMessageError("truncated", f"{len(content)} bytes are no time")
         seconds, nanoseconds = layout.unpack_from(content)
@@ -175,10 +177,6 @@ def decode_clock(content: Any) -> int:
         return stamp_of(content["clock"])
     except (LookupError, TypeError) as error:
         raise MalformedMessageError("encoding", f"it has not the fields of a Clock: {error!r}"[:200]) from None
-
-
-_HEADERS = {b"\0\1": "<", b"\0\0": ">"}
-_SIZE = 4
 
 
 def decode_text(content: Any) -> str:
@@ -193,7 +191,7 @@ def decode_text(content: Any) -> str:
         # A text of ROS 1 is its length and as many bytes; one of ROS 2 has a header, and a zero at the end.
         if len(content) >= _SIZE and struct.unpack_from("<I", content)[0] == len(content) - _SIZE:
             return _as_text(content[_SIZE:])
-        order = _HEADERS.get(content[:2])
+        order = _BYTE_ORDERS.get(content[:2])
         if order is None or len(content) < 2 * _SIZE:
             raise MalformedMessageError("truncated", f"{len(content)} bytes are no text")
         (length,) = struct.unpack_from(f"{order}I", content, _SIZE)

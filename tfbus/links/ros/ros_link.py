@@ -1,4 +1,12 @@
-"""`RosLink`, the base of all links to ROS."""
+"""`RosLink`, the base of all links to ROS, and `RosCarrier`, the half of a carrier that they share.
+
+A carrier decides what goes to which topic, and what comes from there; a subclass connects, publishes and closes. What
+comes is a `RosMessage`: bytes for the link to decode in its turn, in parts if they are many.
+
+A publisher of ROS keeps its last message on ``/tf_static`` for late joiners. So each message that goes there holds all
+static frames that this link sends. ROS has no message that removes a frame: a static one is missing in the next
+message, which late joiners get, and of a moving one nobody is told.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,13 +26,6 @@ from tfbus.links.ros.messages import decode_clock, decode_text
 from tfbus.links.ros.settings import RosOptions, RosSettings
 from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, MalformedMessageError, decode, decode_in_parts, refusal
-
-# The half of a carrier that all links to ROS share: what goes to which topic, and what comes from there.
-#
-# A publisher of ROS keeps its last message on ``/tf_static`` for late joiners. So each message that goes there holds
-# all static frames that this link sends. ROS has no message that removes a frame: a static one is missing in the next
-# message, which late joiners get, and of a moving one nobody is told.
-
 
 MAX_SIZE = 2**22
 """The largest message that is received, in bytes."""
@@ -209,8 +210,8 @@ class RosCarrier:
             moving = not (message.static or message.description)
             self._receive(Received(sender, message, size, moving=moving))
 
-    def _publish_statics(self) -> None:
-        """Publish the static frames once more, for whoever has come or come back."""
+    def publish_statics(self) -> None:
+        """Publish the static frames once more, for a server that has come back or has not taken them."""
         if self._statics:
             self._put(list(self._statics.values()), static=True)
 
@@ -258,19 +259,19 @@ class RosLink(Link):
         The authority of all that comes from ROS; by default the node that has published it, where the link knows it.
     joint_states : callable, optional
         Takes the positions of joints that come from ROS, by their names in rad or m, and the stamp in ns: such as
-        `RobotStatePublisher.publish` of a robot. What it raises is counted in `LinkStatistics.rejected`.
+        `RobotStatePublisher.publish` of a robot. An error that it raises is counted in `LinkStatistics.rejected`.
     joint_topic : str
         The topic of these, by default ``/joint_states``.
     robot_description : callable, optional
         Takes the URDF of the robot, a str, where ROS has it as a topic, as ``robot_state_publisher`` does in ROS 2.
-        What it raises is counted in `LinkStatistics.rejected`.
+        An error that it raises is counted in `LinkStatistics.rejected`.
     description_topic : str
         The topic of that, by default ``/robot_description``.
     clock : SimulatedClock, optional
         Follows ``/clock``, the time of a simulation: it advances, and jumps where that time jumps; one jump back is one
         reset. Give the clock of the bus.
     drop_lost : bool
-        Whether the frames of a lost peer leave the bus, those that it was the last to publish.
+        Whether the frames that a lost peer was the last to publish leave the bus.
     max_frames : int
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
@@ -286,8 +287,8 @@ class RosLink(Link):
     Notes
     -----
     Nothing in ROS tells where a message comes from. So the bus remembers the newest samples of each child that went
-    over it, and takes none of them again: by its child, parent and stamp, a static one by its value as well. Whatever
-    connects the buses and the ROS systems, nothing goes round.
+    over it, and takes none of them again: by its child, parent and stamp, a static one by its value as well. However
+    the buses and the ROS systems are connected, nothing goes round.
 
     Static frames are latched both ways. Each message on ``/tf_static`` holds all that this link sends, because ROS
     keeps only the last message of each publisher. ROS has no message that removes a frame: a removed static frame is

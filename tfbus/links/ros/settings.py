@@ -1,4 +1,8 @@
-"""The settings that all links to ROS share."""
+"""The settings that all links to ROS share: topics, names of frames, and who takes joints, a description, the time.
+
+`RosOptions` are the arguments of a link, as a user writes them; `settings_of` checks them and makes the `RosSettings`
+that a carrier reads. `FrameNames` puts the prefix of a robot in front of its frames and takes it off again.
+"""
 
 import os
 import re
@@ -106,7 +110,6 @@ class FrameNames:
 
 _LAST_DOMAIN = 232
 
-
 JointStates = Callable[[Mapping[str, float], int], object]
 """Takes the positions of joints by their names, in rad or m, and the stamp in ns."""
 
@@ -147,7 +150,7 @@ class RosSettings:
     send : bool
         Whether anything goes out.
     authority : str or None
-        That of all samples that come in; None for the node that has published them, where it is known.
+        The authority of all samples that come in; None for the node that has published them, where it is known.
     joint_states : callable or None
         Takes the positions of joints that come in.
     joint_topic : tuple of str

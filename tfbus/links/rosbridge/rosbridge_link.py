@@ -1,11 +1,32 @@
-"""A link through rosbridge: the transforms of ROS 1 or ROS 2 on a bus, and those of the bus there."""
+"""`RosbridgeLink`: the transforms of ROS 1 or ROS 2 on a bus, and those of the bus there, through a rosbridge server.
+
+`RosbridgeCarrier` holds one connection at a time, and a few tasks for as long as it lasts: one reads, one writes what
+waits, one pings, and three work around what servers do. When the first of them fails, all end, the peer is lost, and
+the carrier connects again. All runs in the event loop, and all times are those of its clock.
+
+Texts wait in three places to be written. Requests go first, in their order. Of the static frames only the newest
+message waits, because each holds all of them. Moving frames are a queue whose oldest give way.
+
+A server tells nobody what it refuses: rosbridge_suite writes it to its own log, and then a static frame never arrives.
+One of ROS 2 does so once its logger has failed, for the next client that advertises a topic whose last client has just
+left; it forgets that topic after ten seconds. But a server gives its clients back what they publish on a topic to which
+they subscribe. So `Confirmation` compares what comes with what was sent, and what does not come back was not taken.
+
+A server of ROS 2 subscribes to a topic as it finds publishers there, and its own are latched: a subscription that meets
+one of them never hears the nodes of ROS. It keeps the publisher of a client that has gone for ten seconds. So after a
+break, a link to ROS 2 that had published moving frames holds them back until the server has forgotten that publisher,
+or gives it the moving frames of others.
+
+Such a server gives latched messages to no later subscriber if it has asked ROS for that topic before there was a
+publisher; and only latched messages if it has asked while another client published there. So while a lookup waits on
+the bus, the link subscribes anew now and then.
+"""
 
 import logging
 import random
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from math import inf
-from time import monotonic
 from typing import Any, Final, Literal, Unpack, get_args
 from uuid import uuid4
 
@@ -14,6 +35,7 @@ import anyio
 from tfbus._aio.task_groups import close_task_group
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._carrier import SendReport
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
@@ -39,27 +61,17 @@ from tfbus.links.rosbridge.protocol import (
 from tfbus.links.rosbridge.websocket import WebSocket, check_url
 from tfbus.tf_message import Decoded, MalformedMessageError
 
-# `Confirmation`, which looks whether a server has taken the static frames of a link.
-#
-# A server tells nobody what it refuses: rosbridge_suite writes it to its own log, and then a static frame never
-# arrives. One of ROS 2 does so once its logger has failed, for the next client that advertises a topic whose last
-# client has just left; it forgets that topic after ten seconds. But a server gives its clients back what they publish
-# on a topic to which they subscribe. So what does not come back was not taken.
-
-
 CONFIRM_TIME, LONGEST_CONFIRM_TIME = 2.0, 30.0
 """s; static frames that have not come back for so long are sent again, and then after twice that time each."""
 
 
 class Confirmation:
-    """Compares what comes with what was sent; see the module.
+    """Looks whether a server has taken the static frames of a link, and has them published again until it has.
 
     Parameters
     ----------
-    url : str
-        How log lines call the server.
-    publish_again : callable
-        Publishes all static frames.
+    carrier : RosbridgeCarrier
+        Publishes the static frames.
 
     Attributes
     ----------
@@ -67,9 +79,8 @@ class Confirmation:
         Whether the server may have refused the topic, so that it has to be advertised again.
     """
 
-    def __init__(self, url: str, publish_again: Callable[[], object]) -> None:
-        self._url = url
-        self._publish_again = publish_again
+    def __init__(self, carrier: "RosbridgeCarrier") -> None:
+        self._carrier = carrier
         self._missing: dict[str, TransformStamped] = {}
         self._sent = anyio.Event()
         self._complete = anyio.Event()
@@ -96,8 +107,8 @@ class Confirmation:
         if not self._missing:
             self._complete.set()
 
-    async def run(self, refused: Callable[[str, Exception, int], object]) -> None:
-        """Publish again what does not come back, until cancelled; `refused` is called as that of a `SendReport`."""
+    async def run(self, report: SendReport) -> None:
+        """Have published again what does not come back, and report it, until cancelled."""
         pause, told = CONFIRM_TIME, False
         while True:
             await self._sent.wait()
@@ -107,27 +118,27 @@ class Confirmation:
                     await self._complete.wait()
             if not self._missing:
                 if told:
-                    logging.getLogger("tfbus").warning("%s has taken all static frames now", self._url)
+                    logging.getLogger("tfbus").warning("%s has taken all static frames now", self._carrier.url)
                 pause, told, self.doubted = CONFIRM_TIME, False, False
             elif not self._sent.is_set():
                 if not told:
-                    refused("not confirmed", self._error(), len(self._missing))
+                    report.refused("not confirmed", self._error(), len(self._missing))
                 told = self.doubted = True
                 pause = min(2 * pause, LONGEST_CONFIRM_TIME)
-                self._publish_again()
+                self._carrier.publish_statics()
             # Otherwise more was sent meanwhile, and has its time too.
 
     def _error(self) -> ConnectionError:
         count, some = len(self._missing), next(iter(self._missing))
         what = f"the static frame {some!r}" if count == 1 else f"{count} static frames, such as {some!r},"
         why = f"within {CONFIRM_TIME:g} s, so it has not taken it: its log may say why"
-        return ConnectionError(f"{self._url} has not given back {what} {why}; the link tries again")
+        return ConnectionError(f"{self._carrier.url} has not given back {what} {why}; the link tries again")
 
 
 MOST_QUEUED = 1_000
 """So many messages wait for a slow server; then the oldest are dropped."""
 MOST_SAID: Final = 20
-"""So many different things that a server says of itself are logged for one connection."""
+"""So many different texts of a server about itself are logged for one connection."""
 Encoding = Literal["cbor", "cbor-raw"]
 CONNECT_TIME = 5.0
 SILENCE = 10.0
@@ -137,7 +148,7 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.25, 5.0
 LINGER_TIME = 11.0
 """s; a server of ROS 2 keeps the publisher of a client that has gone for 10, and then ROS takes a while."""
 ECHO_TIME = 2.0
-"""s; a server of ROS 2 gives the last second of its own clients to those who come, so it may come from this link."""
+"""s; a server of ROS 2 gives a new client the last second of its other clients, so that may come from this link."""
 _CLOSING_TIME = 1.0
 _MISS_PERIODS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """s; while a lookup waits, the static frames are asked for again so often, and then after the last of these."""
@@ -152,28 +163,22 @@ class RosbridgeCarrier(RosCarrier):
     settings : RosSettings
     encoding : {"cbor", "cbor-raw"}
         The encoding that is asked for; a server that does not know it uses another.
-    lookup_waits : callable
-        Whether a lookup on the bus waits for something.
+    bus : Bus
+        While a lookup waits on it, the server is asked again.
     """
 
-    def __init__(
-        self,
-        url: str,
-        settings: RosSettings,
-        encoding: Encoding = "cbor",
-        lookup_waits: Callable[[], bool] = lambda: False,
-    ) -> None:
+    def __init__(self, url: str, settings: RosSettings, encoding: Encoding, bus: Bus) -> None:
         super().__init__(f"rosbridge:{uuid4().hex}", settings)
-        self._url = url
+        self.url = url
         self._wanted: Encoding = encoding
         self._encoding: Encoding = encoding
-        self._lookup_waits = lookup_waits
+        self._bus = bus
         self._socket: WebSocket | None = None
         self._moving: deque[tuple[str, int]] = deque()
         self._changed_statics: str | None = None
         self._requests: deque[str] = deque()
         self._said: set[str] = set()
-        self._confirmation = Confirmation(url, self._publish_statics)
+        self._confirmation = Confirmation(self)
         self._woken = anyio.Event()
         self._of_ros2 = False
         self._advertised = self._heard_moving = False
@@ -183,12 +188,14 @@ class RosbridgeCarrier(RosCarrier):
         self._ending: bool
 
     async def _connect(self) -> None:
-        self._socket = await WebSocket.connect(self._url, MAX_SIZE, CONNECT_TIME)
+        self._socket = await WebSocket.connect(self.url, MAX_SIZE, CONNECT_TIME)
         self._encoding = self._wanted
         if self._of_ros2 and self._advertised:
             self._held_until = self._broken_at + LINGER_TIME
+        if self._held_until <= anyio.current_time():
+            self._held_until = -inf
         self._advertised = self._heard_moving = False
-        self._connected_at = monotonic()
+        self._connected_at = anyio.current_time()
         self._moving.clear()
         self._requests.clear()
         self._said.clear()
@@ -204,8 +211,8 @@ class RosbridgeCarrier(RosCarrier):
             self._request(subscribe(topic, self._encoding, TEXT_TYPE))
         if self.settings.send:
             self._request(advertise(self.settings.tf_static[0], static=True))
-            self._publish_statics()
-        self._receive(Received(self._url, Presence.JOINED))
+            self.publish_statics()
+        self._receive(Received(self.url, Presence.JOINED))
 
     async def run(self) -> None:
         """Talk with the server, and connect again whenever it has gone."""
@@ -235,11 +242,11 @@ class RosbridgeCarrier(RosCarrier):
                 # Else a server that has forgotten the topic takes them, and keeps them for nobody.
                 self._request(advertise(self.settings.tf_static[0], static=True))
         elif self._socket is None:
-            error = ConnectionError(f"{self._url} is not connected")
+            error = ConnectionError(f"{self.url} is not connected")
             self._report.refused("not connected", error, len(samples))
             return False
-        elif monotonic() < self._held_until:
-            error = ConnectionError(f"{self._url} was away, and still has a publisher of that time, which hides others")
+        elif self._held_until > -inf:
+            error = ConnectionError(f"{self.url} was away, and still has a publisher of that time, which hides others")
             self._report.refused("rejoining", error, len(samples))
             return False
         else:
@@ -249,7 +256,7 @@ class RosbridgeCarrier(RosCarrier):
                 self._request(advertise(self.settings.tf[0], static=False))
             if len(self._moving) >= MOST_QUEUED:
                 _, dropped = self._moving.popleft()
-                self._report.refused("congested", OSError(f"{self._url} is too slow for what is published"), dropped)
+                self._report.refused("congested", OSError(f"{self.url} is too slow for what is published"), dropped)
             self._moving.append((publish(self.settings.tf[0], samples), len(samples)))
         self._woken.set()
         return True
@@ -285,15 +292,15 @@ class RosbridgeCarrier(RosCarrier):
         await close_task_group(tasks)
         # Not when the link ends: then there is still something to send.
         self._socket = None
-        self._broken_at = monotonic()
-        self._receive(Received(self._url, Presence.LEFT))
+        self._broken_at = anyio.current_time()
+        self._receive(Received(self.url, Presence.LEFT))
         await socket.close()
 
     async def _until_gone(self, work: Callable[[WebSocket], Any], socket: WebSocket, scope: anyio.CancelScope) -> None:
         try:
             await work(socket)
         except OSError as error:
-            self._report.failed(ConnectionError(f"{self._url}: {error}"))
+            self._report.failed(ConnectionError(f"{self.url}: {error}"))
             scope.cancel()
 
     async def _come_back(self) -> None:
@@ -305,7 +312,7 @@ class RosbridgeCarrier(RosCarrier):
             try:
                 await self._connect()
             except OSError as error:
-                self._report.failed(ConnectionError(f"{self._url}: {error}"))
+                self._report.failed(ConnectionError(f"{self.url}: {error}"))
 
     async def _read_all(self, socket: WebSocket) -> None:
         while True:
@@ -316,7 +323,7 @@ class RosbridgeCarrier(RosCarrier):
             except MalformedMessageError as error:
                 # Thousands of them, each with what it was read from, would be work for the collector.
                 error.__context__ = None
-                self._receive(Received(self._url, error.with_traceback(None)))
+                self._receive(Received(self.url, error.with_traceback(None)))
 
     def _take(self, incoming: Incoming, size: int) -> None:
         if not incoming.topic:
@@ -326,7 +333,7 @@ class RosbridgeCarrier(RosCarrier):
                 self._said.add(incoming.content)
                 # Not to end the line, or to turn it around.
                 said = incoming.content.encode("unicode_escape").decode()
-                self._report.failed(ConnectionError(f"{self._url} says: {said}"))
+                self._report.failed(ConnectionError(f"{self.url} says: {said}"))
             return
         others = {
             "joints": self.settings.joint_topic,
@@ -337,7 +344,7 @@ class RosbridgeCarrier(RosCarrier):
             if incoming.topic in topics:
                 other = RosMessage(incoming.content, static=False, authority="", **{kind: True})
                 # A latched message comes once.
-                self._receive(Received(self._url, other, size, moving=kind != "description"))
+                self._receive(Received(self.url, other, size, moving=kind != "description"))
                 return
         static = incoming.topic in self.settings.tf_static
         if not static and incoming.topic not in self.settings.tf:
@@ -347,13 +354,13 @@ class RosbridgeCarrier(RosCarrier):
         self._of_ros2 = self._of_ros2 or is_of_ros2(incoming.content)
         if not static:
             self._heard_moving = True
-            if monotonic() > self._connected_at + ECHO_TIME:
+            if anyio.current_time() > self._connected_at + ECHO_TIME:
                 self._held_until = -inf
         payload = incoming.content
         if isinstance(payload, dict):
             # Samples take less memory than what they are read from.
             payload = decode_content(payload)
-        self._receive(Received(self._url, RosMessage(payload, static, "rosbridge"), size, moving=not static))
+        self._receive(Received(self.url, RosMessage(payload, static, "rosbridge"), size, moving=not static))
 
     def _ask_for_cbor(self) -> None:
         """Subscribe anew: a server that answers ``cbor-raw`` in JSON may know ``cbor``, which is older."""
@@ -370,7 +377,7 @@ class RosbridgeCarrier(RosCarrier):
                 await self._woken.wait()
 
     async def _end_writing(self) -> None:
-        """Give `_write_all` a little time at the end, for the text that it has begun and for those that wait."""
+        """Give `_write_all` a little time at the end, for the text that it has begun and for the texts that wait."""
         try:
             await anyio.sleep_forever()
         finally:
@@ -394,7 +401,7 @@ class RosbridgeCarrier(RosCarrier):
     async def _keep_alive(self, socket: WebSocket) -> None:
         while True:
             await anyio.sleep(SILENCE / 4)
-            if monotonic() - socket.heard > SILENCE:
+            if anyio.current_time() - socket.heard > SILENCE:
                 raise ConnectionResetError(f"nothing has come for {SILENCE:g} s")
             with anyio.move_on_after(SILENCE) as waited:
                 await socket.ping()
@@ -403,15 +410,11 @@ class RosbridgeCarrier(RosCarrier):
                 raise ConnectionResetError(f"it has read nothing for {SILENCE:g} s")
 
     async def _ask_again(self) -> None:
-        """Subscribe once more while a lookup waits, to the static frames, and to the moving ones if none has come.
-
-        A rosbridge of ROS 2 gives latched messages to no later subscriber if it has asked ROS for that topic before
-        there was a publisher; and only latched messages if it has asked while another client published there.
-        """
+        """While a lookup waits, subscribe anew to the static frames, and to the moving ones if none has come."""
         misses = 0
         while True:
             await anyio.sleep(_MISS_PERIODS[min(misses, len(_MISS_PERIODS) - 1)])
-            if not self._lookup_waits():
+            if not any(buffer.waiting for buffer in self._bus.statistics().buffers):
                 misses = 0
                 continue
             misses += 1
@@ -421,12 +424,8 @@ class RosbridgeCarrier(RosCarrier):
                 self._subscribe_again(self.settings.tf)
 
     async def _end_holding(self) -> None:
-        """Send moving frames again when those of others are heard, or the former publisher of this link has gone.
-
-        A server of ROS 2 subscribes to a topic as it finds publishers there, and its own are latched: a subscription
-        that meets one of them never hears the nodes of ROS. It keeps the publisher of a client for 10 s after that.
-        """
-        await anyio.sleep(max(0.0, self._held_until - monotonic()))
+        """Send moving frames again when the server has forgotten the former publisher of this link."""
+        await anyio.sleep(max(0.0, self._held_until - anyio.current_time()))
         if self._held_until > -inf:
             self._subscribe_again(self.settings.tf)
             self._held_until = -inf
@@ -434,10 +433,10 @@ class RosbridgeCarrier(RosCarrier):
     async def _confirm_statics(self) -> None:
         if self._of_ros2 and self._broken_at > -inf:
             # Until then, they come from the publisher of the connection that broke.
-            await anyio.sleep(max(0.0, self._broken_at + LINGER_TIME - monotonic()))
+            await anyio.sleep(max(0.0, self._broken_at + LINGER_TIME - anyio.current_time()))
             self._confirmation.doubted = True
-            self._publish_statics()
-        await self._confirmation.run(lambda *what: self._report.refused(*what))
+            self.publish_statics()
+        await self._confirmation.run(self._report)
 
     def _subscribe_again(self, topics: Iterable[str]) -> None:
         for topic in topics:
@@ -464,7 +463,7 @@ class RosbridgeLink(RosLink):
         The encoding in which messages are asked for; a server that does not know it sends JSON, which is read too. See
         the notes before you take ``"cbor-raw"``.
     **options
-        Those that all links to ROS share: see `tfbus.links.ros.RosLink`. By default, the authority of all samples is
+        All links to ROS share them: see `tfbus.links.ros.RosLink`. By default, the authority of all samples is
         ``"rosbridge"``, because the server does not tell who has published them.
 
     Attributes
@@ -497,7 +496,7 @@ class RosbridgeLink(RosLink):
     A server asks ROS once for each topic, for all its clients, as the first of them wants it: decoded, or as bytes.
     With ``"cbor"`` this link and clients that want JSON, such as roslib in a browser, hear the same topics side by
     side. ``"cbor-raw"`` passes on the bytes of ROS, which costs the server half as much for messages of 20 transforms,
-    and hardly less for one; but beside a client that wants anything else, whoever came second hears nothing, and no
+    and hardly less for one; but beside a client that wants anything else, the second of the two hears nothing, and no
     server tells it. Take ``"cbor-raw"`` for a server of your own, or for one whose other clients take it too. Positions
     of joints are asked for in JSON, unless you take it, because a server of ROS 1 cannot put their names into CBOR.
 
@@ -508,7 +507,7 @@ class RosbridgeLink(RosLink):
     back within 2 s are told in a log line, counted in `LinkStatistics.not_sent` as ``"not confirmed"``, and advertised
     and sent again until they do.
 
-    Whoever reaches the server can publish and read everything.
+    Every program that reaches the server can publish and read everything.
     """
 
     def __init__(self, bus: Bus, url: str, *, encoding: Encoding = "cbor", **options: Unpack[RosOptions]) -> None:
@@ -518,7 +517,4 @@ class RosbridgeLink(RosLink):
         if encoding not in get_args(Encoding):
             raise ValueError(f"encoding must be 'cbor' or 'cbor-raw', not {encoding!r}")
         self.url = url
-        carrier = RosbridgeCarrier(
-            url, settings_of(options), encoding, lambda: any(buffer.waiting for buffer in bus.statistics().buffers)
-        )
-        super().__init__(bus, url, carrier, **options)
+        super().__init__(bus, url, RosbridgeCarrier(url, settings_of(options), encoding, bus), **options)

@@ -3,7 +3,6 @@
 import ssl
 from collections.abc import Iterator
 from io import StringIO
-from time import monotonic
 from typing import Self
 from urllib.parse import SplitResult, urlsplit
 
@@ -27,7 +26,7 @@ from tfbus._aio.turn_budget import TurnBudget
 _AT_ONCE = 2**16
 _GONE = (anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError)
 _CLOSING_TIME = 1.0
-"""s; an end that reads nothing is told so long that this one closes."""
+"""s; this end tries so long to tell an end that reads nothing that it closes."""
 _PORTS = {"ws": 9090, "wss": 443}
 
 
@@ -64,7 +63,7 @@ class WebSocket:
     Attributes
     ----------
     heard : float
-        The monotonic time in s when the last bytes came.
+        The time of the event loop in s when the last bytes came.
     """
 
     def __init__(self, stream: anyio.abc.ByteStream, max_size: int) -> None:
@@ -74,7 +73,7 @@ class WebSocket:
         self._received: Iterator[Event] = iter(())
         self._budget = TurnBudget()
         self._sending = anyio.Lock()
-        self.heard = monotonic()
+        self.heard = anyio.current_time()
 
     @classmethod
     async def connect(cls, url: str, max_size: int, timeout: float) -> Self:
@@ -117,7 +116,7 @@ class WebSocket:
         Raises
         ------
         OSError
-            If the other end has closed, is gone, sends a message that is too large, or what is no websocket.
+            If the other end has closed or is gone, or sends a message that is too large, or no websocket.
         """
         text, data = StringIO(), bytearray()
         size = 0
@@ -169,7 +168,7 @@ class WebSocket:
                     return event
                 data = await self._stream.receive(_AT_ONCE)
                 self._budget.begin()
-                self.heard = monotonic()
+                self.heard = anyio.current_time()
                 self._connection.receive_data(data)
                 self._received = self._connection.events()
             except _GONE:

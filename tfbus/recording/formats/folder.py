@@ -122,7 +122,7 @@ class SqliteStorage:
         return self._file.execute(statement, values or [])
 
     def _recover(self, path: Path, journals: list[Path]) -> None:
-        """Open a copy of a file, of which SQLite has undone what its journal says was not finished."""
+        """Open a copy of a file, in which SQLite has undone the unfinished transaction of its journal."""
         # Where open files cannot be removed, the folder stays until the system empties it.
         with TemporaryDirectory(prefix="tfbus-", ignore_cleanup_errors=True) as folder:
             copy = Path(folder, "copy.db3")
@@ -400,7 +400,7 @@ class FolderStorage:
             yield from batches(self._shortfalls(now, wanted, read))
 
     def _shortfalls(self, now: int, wanted: Wanted, read: Counter[Channel]) -> Iterator[StoredMessage]:
-        """A report for each topic of which the metadata promise messages that the files neither promise nor have."""
+        """Report each topic with messages that the metadata promise, and that the files neither promise nor have."""
         assert self._promised is not None
         known: dict[str, list[Channel]] = {}
         for channel in self.channels:

@@ -196,7 +196,7 @@ class McapReading:
         size = self._storage.size
         places, too_long = [], set()
         for place, length, _, numbers in self._storage.index:
-            # Without numbers, or with unknown ones, only reading the chunk tells what is in it.
+            # An index without numbers of channels, or with unknown ones, does not tell whether the chunk is wanted.
             if place.start <= high and place.end >= low and (not numbers or any(map(self._may_be_wanted, numbers))):
                 places.append(place)
                 if place.offset + length > size:
@@ -457,7 +457,7 @@ class McapStorage:
             with suppress(*DAMAGE, EndOfFile):
                 self._use_index(start)
         if self._statistics is None:
-            # They would contradict what the chunks say.
+            # Descriptions of a damaged index would contradict those in the chunks.
             self._schemas.clear()
             self._numbered.clear()
             self._budget = DescriptionBudget()
@@ -500,7 +500,7 @@ class McapStorage:
             statistics is not None
             and statistics.channel_message_counts.keys() <= self._numbered.keys()
             and kinds <= {0, *self._schemas}
-            # Else a small file could have one chunk read any number of times.
+            # An index that names one chunk again and again would make a small file cost any amount of reading.
             and len({chunk.place.offset for chunk in chunks}) == len(chunks)
         ):
             self._statistics = statistics

@@ -364,7 +364,7 @@ def scan_chunks(
     ------
     One of `DAMAGE`.
     """
-    # For the head of the last message, whatever its length.
+    # The padding lets numpy read a whole head at the last record, however short that is.
     padded = np.frombuffer(data + bytes(_MESSAGE_HEAD.itemsize), np.uint8)
     opcodes = padded[begins]
     is_message = opcodes == _MESSAGE_OPCODE

@@ -451,11 +451,11 @@ class Ros1Storage:
                     if at > self._size:
                         raise CutOffError("the index goes on behind the end of the file")
                     self._use_index_record(record, missing)
-                # Else a small file could have one chunk read any number of times.
+                # An index that names one chunk again and again would make a small file cost any amount of reading.
                 if not any(missing) and len({chunk.offset for chunk in self._chunks}) == len(self._chunks):
                     return True
         except DAMAGE:
-            # Then the chunks are searched.
+            # The caller searches for the chunks.
             pass
         self._chunks.clear()
         self._numbered.clear()
@@ -535,7 +535,7 @@ class Ros1Storage:
             content = self._content(record.offset, torn, budget)
             ends = ends or [received for received, _, _ in content.messages]
             if not ends and content.damage:
-                # It has no log time, so it is told at the start.
+                # The damage has no log time, so it is reported at the start.
                 self._damage.append(f"the chunk at byte {record.offset}: {content.damage}")
         if ends:
             self._chunks.append(_Chunk(min(ends), max(ends), record.offset, counts or None))

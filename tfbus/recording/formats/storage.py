@@ -56,7 +56,7 @@ MIN_UNFOLDED: Final = 1_024 * MIB
 
 
 class DescriptionBudget:
-    """Counts what a file describes and a reader keeps; chunks unfold, so a small file could describe any number."""
+    """Counts the descriptions that a reader keeps: the chunks of a small file could unfold to any number of them."""
 
     def __init__(self) -> None:
         self._left = MAX_DESCRIBED
@@ -309,7 +309,7 @@ def merge_chunks(
     read : callable
         Gives the messages of a chunk in the order of the file.
     """
-    # Then equal log times need not wait for the next chunk.
+    # In the order of the file, a message does not wait for a later chunk that begins at its log time.
     in_file_order = all(before.offset < after.offset for before, after in pairwise(places))
     waiting: list[StoredMessage] = []
     origins: list[int] = []
