@@ -15,13 +15,11 @@ from typing import Any, Unpack
 from tfbus.bus.bus import Bus
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links._carrier import SendReport
-from tfbus.links._entries import OutgoingBatch
-from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
-from tfbus.links._outbox import Turn
-from tfbus.links._provenance import ReceivedTransform
-from tfbus.links._receive_queue import Received
+from tfbus.links.carrier import Received, ReceivedMessage, SendReport
+from tfbus.links.endpoint import ForeignEnd
 from tfbus.links.link import Link
+from tfbus.links.outbox import OutgoingBatch, Turn
+from tfbus.links.relay import ReceivedBatch, ReceivedTransform
 from tfbus.links.ros.messages import decode_clock, decode_text
 from tfbus.links.ros.settings import RosOptions, RosSettings
 from tfbus.robot.joint_state_message import decode_joint_state
@@ -72,7 +70,7 @@ class RosMessage:
 
 
 class RosCarrier:
-    """A carrier to ROS, see `tfbus.links._carrier.Carrier`; a subclass connects, publishes and closes.
+    """A carrier to ROS, see `tfbus.links.carrier.Carrier`; a subclass connects, publishes and closes.
 
     Parameters
     ----------
@@ -108,7 +106,7 @@ class RosCarrier:
             self._put(moving[first : first + MOST_TRANSFORMS], static=False)
         changed = False
         for frame, change in turn.statics.items():
-            sample = self._outgoing(change.samples[0]) if isinstance(change, OutgoingBatch) else None
+            sample = None if change is None else self._outgoing(change)
             if sample is not None:
                 self._statics[frame] = sample
                 changed = True
@@ -162,8 +160,8 @@ class RosCarrier:
                 errors.append(error.with_traceback(None))
             else:
                 samples.append(sample)
-        entries: list[Any] = [ReceivedBatch(samples, {authority})] if samples else []
-        return ReceivedMessage(entries, errors=errors, continues=content.continues)
+        batches = [ReceivedBatch(samples, {authority})] if samples else []
+        return ReceivedMessage(batches, errors=errors, continues=content.continues)
 
     async def run(self) -> None:
         """Do nothing that takes time."""
@@ -298,13 +296,12 @@ class RosLink(Link):
     """
 
     def __init__(self, bus: Bus, name: str, carrier: RosCarrier, **options: Unpack[RosOptions]) -> None:
-        super().__init__(
+        end = ForeignEnd(
             bus,
             name,
             carrier,
             frames=options.get("frames"),
             drop_lost=options.get("drop_lost", False),
             max_frames=options.get("max_frames", 10_000),
-            capacity=options.get("capacity", 10_000),
-            clock=options.get("clock"),
         )
+        super().__init__(end, capacity=options.get("capacity", 10_000), clock=options.get("clock"))

@@ -35,9 +35,8 @@ import anyio
 from tfbus._aio.task_groups import close_task_group
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links._carrier import SendReport
-from tfbus.links._provenance import ReceivedTransform
-from tfbus.links._receive_queue import Presence, Received
+from tfbus.links.carrier import Presence, Received, SendReport
+from tfbus.links.relay import ReceivedTransform
 from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, settings_of
 from tfbus.links.rosbridge.protocol import (
