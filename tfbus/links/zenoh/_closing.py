@@ -10,6 +10,7 @@ import os
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
+from typing import Protocol
 
 import zenoh
 
@@ -48,7 +49,13 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_note_fork)
 
 
-def close_session(session: zenoh.Session | None) -> None:
+class Closable(Protocol):
+    """A session of zenoh, or what belongs to one."""
+
+    def close(self) -> None: ...
+
+
+def close_session(session: Closable | None) -> None:
     """Close a session, if there is one; a second call does nothing, and so does one in a child made by `fork`."""
     if session is not None and not _forked:
         # zenoh may give up waiting for a peer; that peer notices the end by itself.
@@ -56,7 +63,7 @@ def close_session(session: zenoh.Session | None) -> None:
             session.close()
 
 
-def begin_to_close(session: zenoh.Session | None) -> threading.Thread:
+def begin_to_close(session: Closable | None) -> threading.Thread:
     """Close a session in a thread of its own; returns the thread."""
     # Not a thread that the interpreter waits for without a limit.
     closing = threading.Thread(target=close_session, args=(session,), name=_NAME, daemon=True)
