@@ -1,15 +1,15 @@
 """A zenoh router in this process, which links and other routers connect to."""
 
-import weakref
+import atexit
+import threading
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Final, Self
 
 import anyio
 import anyio.to_thread
-import zenoh
 
-from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
+from tfbus.links.zenoh._closing import close_session, wait_at_exit, wait_until_closed
 from tfbus.links.zenoh.addresses import Addresses, open_session, router_config
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
@@ -53,20 +53,46 @@ class ZenohRouter:
         lease: float | None = None,
     ) -> None:
         self._config = router_config(listen, connect or (), config, lease)
-        self._entered = False
-        self._session: zenoh.Session | None = None
+        self._keeper: threading.Thread | None = None
+        self._opened, self._stopped = threading.Event(), threading.Event()
+        self._failure: Exception | None = None
 
     async def __aenter__(self) -> Self:
-        if self._entered:
+        if self._keeper is not None:
             raise RuntimeError("a router is entered once: make another one")
-        self._entered = True
-        self._session = await anyio.to_thread.run_sync(open_session, self._config)
+        self._keeper = threading.Thread(target=self._keep, daemon=True)
+        wait_at_exit(self._keeper)
         # A program may exit without the end of its router.
-        self._close_at_exit = weakref.finalize(self, close_session, self._session)
+        atexit.register(self._stopped.set)
+        self._keeper.start()
+        try:
+            await anyio.to_thread.run_sync(self._opened.wait, abandon_on_cancel=True)
+            if self._failure is not None:
+                raise self._failure
+        except BaseException:
+            await self._end(self._keeper)
+            raise
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._close_at_exit.detach()
-        await wait_until_closed([begin_to_close(self._session)])
+        if self._keeper is not None:
+            await self._end(self._keeper)
+
+    async def _end(self, keeper: threading.Thread) -> None:
+        self._stopped.set()
+        atexit.unregister(self._stopped.set)
+        await wait_until_closed([keeper])
+
+    def _keep(self) -> None:
+        """Open a session, and close it when the router has stopped; in a thread, because zenoh's calls block."""
+        try:
+            session = open_session(self._config)
+        except (OSError, RuntimeError) as error:
+            self._failure = error
+            return
+        finally:
+            self._opened.set()
+        self._stopped.wait()
+        close_session(session)
