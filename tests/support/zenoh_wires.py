@@ -41,7 +41,7 @@ class Ear:
         return [(link, item) for link, item in list(self.items) if isinstance(item, bytes)]
 
     def of(self, other: "Ear") -> list[WireItem]:
-        """What has come of another one."""
+        """All items of another one."""
         return [item for link, item in list(self.items) if link == other.id]
 
     def receive(self, link: str, item: WireItem) -> None:

@@ -386,8 +386,8 @@ async def test_a_router_that_is_stopped_holds_nobody_up(address: str, domain: st
 
 
 async def test_a_link_needs_the_address_of_a_router(domain: str) -> None:
-    for nothing in ({}, {"connect": None}, {"connect": []}, {"connect": ""}):
-        options: dict[str, Any] = nothing
+    given: list[dict[str, Any]] = [{}, {"connect": None}, {"connect": []}, {"connect": ""}]
+    for options in given:
         with pytest.raises(ValueError, match=r"connect='tcp/host:7447'.* the local link"):
             ZenohWire(domain, **options)
 

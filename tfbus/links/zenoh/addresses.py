@@ -1,4 +1,4 @@
-"""Where a zenoh session listens and to which router it connects, with all its other settings; and its beginning."""
+"""The settings of a zenoh session, above all its addresses; and its beginning."""
 
 import json
 import math

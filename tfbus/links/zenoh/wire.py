@@ -247,7 +247,7 @@ class ZenohWire:
         try:
             for channel in channels:
                 session.declare(channel)
-            # Whoever joins may be sent something at once.
+            # The owner may send something to a link as soon as that has joined.
             self._session = session
             session.begin(self._domain, self._number, self._hears, breaks=not self._is_router)
         except zenoh.ZError as error:
@@ -341,7 +341,7 @@ class _Session:
 
 
 class _Hearer:
-    """What comes by one session, in zenoh's threads; it holds none of zenoh's objects, which hold it."""
+    """Takes all that comes by one session, in zenoh's threads; it holds none of zenoh's objects, which hold it."""
 
     def __init__(
         self, link: str, domain: str, hears: Sequence[_Heard], receive: Receive, changed: threading.Event
