@@ -13,7 +13,7 @@ from tfbus.links.zenoh._closing import close_session, wait_at_exit, wait_until_c
 from tfbus.links.zenoh.addresses import Addresses, open_session, router_config
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
-"""Where a router without an address listens: for the processes of this machine only."""
+"""The address of a router that is given none: only processes of this machine reach it."""
 
 
 class ZenohRouter:
