@@ -22,6 +22,10 @@ dropped, and no call waits for room longer than zenoh's 50 ms, once each time th
 `MAX_LINKS` others are present at once; `MAX_CHANNELS` channels have a publisher.
 
 Both kinds of messages have one priority, because zenoh keeps the order only within one.
+
+Access control by a router's rules: ``put`` and ``delete`` on ``tfbus/**`` are what a link publishes,
+``liveliness_token`` on ``tfbus/**/@alive/**`` is that it is announced, and ``put`` on ``tfbus/**/@to/*`` what it sends
+to one link. In zenoh ``**`` stands for no part that begins with ``@``. The id of a sender proves nothing.
 """
 
 import atexit
