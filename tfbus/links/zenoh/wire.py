@@ -28,7 +28,6 @@ Access control by a router's rules: ``put`` and ``delete`` on ``tfbus/**`` are w
 to one link. In zenoh ``**`` stands for no part that begins with ``@``. The id of a sender proves nothing.
 """
 
-import atexit
 import math
 import os
 import re
@@ -46,7 +45,7 @@ import zenoh
 
 from tfbus._aio.loops import LoopWaker
 from tfbus.links.wire import MAX_MESSAGE, Hearing, Joined, Left, Receive
-from tfbus.links.zenoh._closing import begin_to_close, close_session, use_zenoh, wait_at_exit, wait_until_closed
+from tfbus.links.zenoh._closing import Keeper, begin_to_close, close_session
 from tfbus.links.zenoh.addresses import (
     LONGEST_NAME,
     Addresses,
@@ -132,9 +131,7 @@ class ZenohWire:
             )
         self._session: _Session | None = None
         self._number = 0
-        self._keeper: threading.Thread | None = None
-        self._changed = threading.Event()
-        self._closed = False
+        self._keeper = Keeper(self._keep)
         self._failure: OSError | None = None
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
@@ -149,16 +146,11 @@ class ZenohWire:
         RuntimeError
             If this process was forked from one that uses zenoh.
         """
-        use_zenoh()
         self._hears = [(robots_expression(robots), robots_pattern(robots), channel) for robots, channel in hears]
         self._receive, self._warn = receive, warn
         self._tried = anyio.Event()
         self._waker = LoopWaker(self._tell)
         self._waker.bind()
-        self._keeper = threading.Thread(target=self._keep, daemon=True)
-        wait_at_exit(self._keeper)
-        # A program may exit without the end of its links.
-        atexit.register(self._stop)
         self._keeper.start()
         with anyio.move_on_after(math.inf if self._is_router else FIRST_WAIT):
             await self._tried.wait()
@@ -181,24 +173,16 @@ class ZenohWire:
 
     async def close(self) -> None:
         """See `tfbus.links.wire.Wire`. It warns if zenoh goes on closing in the background."""
-        self._stop()
-        atexit.unregister(self._stop)
-        if self._keeper is not None and self._keeper.ident is not None:
-            late = await wait_until_closed([self._keeper])
-            if late is not None:
-                self._warn(late)
+        late = await self._keeper.end()
+        if late is not None:
+            self._warn(late)
 
     def _tell(self) -> None:
         """Let `open` return, and warn; on the event loop."""
         self._tried.set()
-        if not self._is_router and not self._closed and self._failure is not None:
+        if not self._is_router and not self._keeper.stopped and self._failure is not None:
             failure, self._failure = self._failure, None
             self._warn(failure)
-
-    def _stop(self) -> None:
-        """Have the thread below close its session and end; from any thread."""
-        self._closed = True
-        self._changed.set()
 
     # The thread that opens and closes sessions
 
@@ -207,12 +191,12 @@ class ZenohWire:
         channels: list[str] = []
         while (session := self._connect(channels)) is not None:
             self._wake()
-            while not (self._closed or session.hearer.broken):
-                self._changed.wait()
-                self._changed.clear()
+            while not (self._keeper.stopped or session.hearer.broken):
+                self._keeper.changed.wait()
+                self._keeper.changed.clear()
             self._session = None
             channels = session.channels
-            if self._closed:
+            if self._keeper.stopped:
                 close_session(session)
                 return
             session.hearer.end()
@@ -224,7 +208,7 @@ class ZenohWire:
         since: float | None = monotonic()
         while True:
             for _ in range(max(1, len(self._addresses))):
-                if self._closed:
+                if self._keeper.stopped:
                     return None
                 try:
                     return self._connect_once(channels)
@@ -240,13 +224,13 @@ class ZenohWire:
             self._wake()
             if self._is_router:
                 return None
-            self._changed.wait(uniform(*PAUSE))
-            self._changed.clear()
+            self._keeper.changed.wait(uniform(*PAUSE))
+            self._keeper.changed.clear()
 
     def _connect_once(self, channels: Iterable[str]) -> "_Session":
         self._number += 1
         raw = open_session(self._config) if self._is_router else open_client(self._config, self._addresses[0])
-        hearer = _Hearer(self.id, self._domain, self._hears, self._receive, self._changed)
+        hearer = _Hearer(self.id, self._domain, self._hears, self._receive, self._keeper.changed)
         session = _Session(raw, hearer, self._own, self.id)
         try:
             for channel in channels:

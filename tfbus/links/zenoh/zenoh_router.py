@@ -1,6 +1,5 @@
 """A zenoh router in this process, which links and other routers connect to."""
 
-import atexit
 import threading
 from collections.abc import Mapping
 from types import TracebackType
@@ -9,7 +8,7 @@ from typing import Any, Final, Self
 import anyio
 import anyio.to_thread
 
-from tfbus.links.zenoh._closing import close_session, wait_at_exit, wait_until_closed
+from tfbus.links.zenoh._closing import Keeper, close_session
 from tfbus.links.zenoh.addresses import Addresses, open_session, router_config
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
@@ -53,46 +52,38 @@ class ZenohRouter:
         lease: float | None = None,
     ) -> None:
         self._config = router_config(listen, connect or (), config, lease)
-        self._keeper: threading.Thread | None = None
-        self._opened, self._stopped = threading.Event(), threading.Event()
-        self._failure: Exception | None = None
+        self._keeper = Keeper(self._keep)
+        self._entered = False
+        self._opened = threading.Event()
+        self._failure: OSError | None = None
 
     async def __aenter__(self) -> Self:
-        if self._keeper is not None:
+        if self._entered:
             raise RuntimeError("a router is entered once: make another one")
-        self._keeper = threading.Thread(target=self._keep, daemon=True)
-        wait_at_exit(self._keeper)
-        # A program may exit without the end of its router.
-        atexit.register(self._stopped.set)
+        self._entered = True
         self._keeper.start()
         try:
             await anyio.to_thread.run_sync(self._opened.wait, abandon_on_cancel=True)
             if self._failure is not None:
                 raise self._failure
         except BaseException:
-            await self._end(self._keeper)
+            await self._keeper.end()
             raise
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if self._keeper is not None:
-            await self._end(self._keeper)
-
-    async def _end(self, keeper: threading.Thread) -> None:
-        self._stopped.set()
-        atexit.unregister(self._stopped.set)
-        await wait_until_closed([keeper])
+        await self._keeper.end()
 
     def _keep(self) -> None:
-        """Open a session, and close it when the router has stopped; in a thread, because zenoh's calls block."""
         try:
             session = open_session(self._config)
-        except (OSError, RuntimeError) as error:
+        except OSError as error:
             self._failure = error
             return
         finally:
             self._opened.set()
-        self._stopped.wait()
+        while not self._keeper.stopped:
+            self._keeper.changed.wait()
         close_session(session)
