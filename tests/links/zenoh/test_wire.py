@@ -518,7 +518,7 @@ anyio.run(main)
 @contextmanager
 def stranger(address: str) -> Iterator[zenoh.Session]:
     """A session of zenoh that says what it likes."""
-    with open_client(client_config(None, None), address) as session:
+    with open_client(client_config(address, None, None), address) as session:
         yield session
 
 

@@ -122,7 +122,7 @@ class ZenohWire:
         if listen is not None:
             self._config = router_config(listen, self._addresses, config, lease)
         elif self._addresses:
-            self._config = client_config(config, lease)
+            self._config = client_config(self._addresses, config, lease)
         else:
             raise ValueError(
                 "a link over zenoh needs a router: connect='tcp/host:7447' is the address of one, and "
