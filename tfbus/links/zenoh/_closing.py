@@ -8,8 +8,9 @@ would a thread that comes back from a call of zenoh.
 import atexit
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import Protocol
 
 import zenoh
 
@@ -48,7 +49,13 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_note_fork)
 
 
-def close_session(session: zenoh.Session | None) -> None:
+class Closable(Protocol):
+    """A session of zenoh, or what belongs to one."""
+
+    def close(self) -> None: ...
+
+
+def close_session(session: Closable | None) -> None:
     """Close a session, if there is one; a second call does nothing, and so does one in a child made by `fork`."""
     if session is not None and not _forked:
         # zenoh may give up waiting for a peer; that peer notices the end by itself.
@@ -56,7 +63,7 @@ def close_session(session: zenoh.Session | None) -> None:
             session.close()
 
 
-def begin_to_close(session: zenoh.Session | None) -> threading.Thread:
+def begin_to_close(session: Closable | None) -> threading.Thread:
     """Close a session in a thread of its own; returns the thread."""
     # Not a thread that the interpreter waits for without a limit.
     closing = threading.Thread(target=close_session, args=(session,), name=_NAME, daemon=True)
@@ -74,6 +81,46 @@ async def wait_until_closed(closing: Sequence[threading.Thread]) -> TimeoutError
 def wait_at_exit(thread: threading.Thread) -> None:
     """Have the interpreter, at its end, wait for a thread that is to end."""
     thread.name = _NAME
+
+
+class Keeper:
+    """The thread in which a wire or a router opens and closes its sessions, because zenoh's calls block.
+
+    A program that exits without the end of its links has them closed all the same.
+
+    Parameters
+    ----------
+    keep : callable
+        What the thread does. It returns soon after `stopped`; it waits for `changed` meanwhile.
+
+    Attributes
+    ----------
+    changed : threading.Event
+        Set when there is something to do, for instance because of `stop`.
+    stopped : bool
+    """
+
+    def __init__(self, keep: Callable[[], object]) -> None:
+        self.changed = threading.Event()
+        self.stopped = False
+        self._thread = threading.Thread(target=keep, name=_NAME, daemon=True)
+
+    def start(self) -> None:
+        """Begin; raises as `use_zenoh`."""
+        use_zenoh()
+        atexit.register(self.stop)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Have the thread end; from any thread."""
+        self.stopped = True
+        self.changed.set()
+
+    async def end(self) -> TimeoutError | None:
+        """Have the thread end, and wait for it as `wait_until_closed` does; also if it has not begun."""
+        self.stop()
+        atexit.unregister(self.stop)
+        return await wait_until_closed([] if self._thread.ident is None else [self._thread])
 
 
 @atexit.register

@@ -1,0 +1,266 @@
+import errno
+import json
+import math
+import shutil
+import socket
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from support.processes import free_address, until
+from support.zenoh_wires import LIVE, listening, met, talk
+
+from tfbus.links.wire import MAX_MESSAGE, Joined
+from tfbus.links.zenoh.addresses import (
+    LEASE,
+    SIGNS_OF_LIFE,
+    Addresses,
+    client_config,
+    endpoints,
+    open_client,
+    open_session,
+    router_config,
+)
+from tfbus.links.zenoh.zenoh_router import ZenohRouter
+
+ROUTER = "tcp/127.0.0.1:7447"
+
+
+def read(config: zenoh.Config, path: str) -> Any:
+    return json.loads(config.get_json(path))
+
+
+@pytest.mark.parametrize("addresses", ["tcp/10.0.0.1:7447", ["tcp/10.0.0.1:7447"], iter(["tcp/10.0.0.1:7447"])])
+def test_one_address_may_be_given_as_text_or_in_a_list(addresses: Addresses) -> None:
+    assert endpoints(addresses) == ["tcp/10.0.0.1:7447"]
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "",
+        "garbage",
+        "127.0.0.1:7447",
+        "tcp/",
+        "tcp/127.0.0.1",
+        "tcp/127.0.0.1:",
+        "tcp/127.0.0.1:65536",
+        "xyz/1.2.3.4:5",
+    ],
+)
+def test_an_error_names_a_malformed_address(address: str) -> None:
+    for addresses in ([address], ["tcp/127.0.0.1:7000", address]):
+        with pytest.raises(ValueError, match=f"not {address!r}"):
+            endpoints(addresses)
+        with pytest.raises(ValueError, match=f"not {address!r}"):
+            router_config(addresses, (), None, None)
+        with pytest.raises(ValueError, match=f"not {address!r}"):
+            client_config(addresses, None, None)
+
+
+@pytest.mark.parametrize("address", ["tcp/host:7447#", "tcp/host:7447?", "tcp/host:7447?#"])
+def test_an_address_that_zenoh_alone_finds_malformed_is_refused_at_once(address: str) -> None:
+    with pytest.raises(ValueError, match="zenoh does not take") as client:
+        client_config([ROUTER, address], None, None)
+    with pytest.raises(ValueError, match="zenoh does not take") as router:
+        router_config(ROUTER, address, None, None)
+    assert address in str(client.value)
+    assert address in str(router.value)
+
+
+@pytest.mark.anyio
+async def test_an_address_at_which_zenoh_panics_is_passed_over(
+    address: str, domain: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    bad = f"{address}?rel=3"
+    async with (
+        ZenohRouter(address),
+        listening(domain, connect=[bad, address]) as one,
+        listening(domain, connect=address) as two,
+    ):
+        await met(one, two)
+    with pytest.raises(OSError, match="Reliability"):
+        async with ZenohRouter(bad):
+            raise AssertionError("it has opened")
+    capfd.readouterr()
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "tcp/[::1]:7447",
+        "tls/robot.local:0",
+        "udp/0.0.0.0:7447",
+        "quic/robot:1#iface=eth0",
+        "unixsock-stream//tmp/robot",
+    ],
+)
+def test_addresses_of_all_kinds_go_through(address: str) -> None:
+    config = router_config(address, address, None, None)
+    assert read(config, "listen/endpoints") == read(config, "connect/endpoints") == [address]
+
+
+def test_each_end_announces_its_lease_and_says_more_often_that_it_lives() -> None:
+    for config, lease in (
+        (client_config(ROUTER, None, None), LEASE),
+        (router_config("tcp/127.0.0.1:0", (), None, 1.5), 1.5),
+    ):
+        assert read(config, "transport/link/tx/lease") == lease * 1_000
+        assert read(config, "transport/link/tx/keep_alive") == SIGNS_OF_LIFE
+
+
+def test_settings_of_zenoh_win_over_those_of_the_link() -> None:
+    config = client_config(ROUTER, {"transport/link/tx/lease": 7_000, "transport/link/tx/queue/size/data": 4}, 2.0)
+    assert read(config, "transport/link/tx/lease") == 7_000
+    assert read(config, "transport/link/tx/queue/size/data") == 4
+
+
+def test_nobody_is_looked_for_and_no_message_is_assembled_that_no_link_takes() -> None:
+    for config in (client_config(ROUTER, None, None), router_config("tcp/127.0.0.1:0", (), None, None)):
+        assert read(config, "scouting/multicast/enabled") is False
+        assert MAX_MESSAGE < read(config, "transport/link/rx/max_message_size") < 2 * MAX_MESSAGE
+
+
+@pytest.mark.parametrize("lease", [0.0, -1.0, math.nan, math.inf])
+def test_a_lease_is_a_time_that_passes(lease: float) -> None:
+    with pytest.raises(ValueError, match="lease"):
+        client_config(ROUTER, None, lease)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [("no/such/setting", 1), ("transport/link/tx/lease", "long"), ("", 1)],
+)
+def test_a_setting_that_zenoh_does_not_take_is_named_with_its_value(path: str, value: object) -> None:
+    with pytest.raises(ValueError, match="zenoh does not take") as caught:
+        client_config(ROUTER, {path: value}, None)
+    assert repr(path) in str(caught.value)
+    assert repr(value) in str(caught.value)
+    assert ".rs:" not in str(caught.value)
+
+
+def test_a_setting_that_is_not_json_is_named() -> None:
+    with pytest.raises(ValueError, match="'metadata'"):
+        client_config(ROUTER, {"metadata": object()}, None)
+
+
+@pytest.mark.parametrize("path", ["id", "mode", "listen", "listen/endpoints", "connect", "connect/endpoints/client"])
+def test_who_a_session_is_and_where_it_goes_are_no_settings(path: str) -> None:
+    with pytest.raises(ValueError, match=f"{path!r} is not for config: give addresses by connect and listen"):
+        client_config(ROUTER, {path: "x"}, None)
+
+
+def test_a_port_in_use_is_an_os_error_with_its_number() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        config = router_config(f"tcp/127.0.0.1:{server.getsockname()[1]}", (), None, None)
+        with pytest.raises(OSError, match="zenoh cannot open a session") as caught:
+            open_session(config)
+    assert caught.value.errno == errno.EADDRINUSE
+    assert ".rs:" not in str(caught.value)
+
+
+def test_an_os_error_that_only_zenoh_has_found_has_no_number() -> None:
+    with pytest.raises(OSError, match="private key") as caught:
+        open_session(router_config("tls/127.0.0.1:0", (), None, None))
+    assert caught.value.errno is None
+
+
+def test_a_router_that_is_not_there_is_an_os_error() -> None:
+    with pytest.raises(OSError, match="zenoh cannot open a session"):
+        open_client(client_config(ROUTER, None, None), free_address())
+
+
+# TLS and access control
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a certificate authority's own certificate, and those that it gave to a robot and to a guest."""
+    openssl = shutil.which("openssl")
+    if openssl is None:
+        pytest.skip("needs the program openssl")
+    folder = tmp_path_factory.mktemp("certificates")
+    new = [openssl, "req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
+
+    def call(*arguments: str) -> None:
+        subprocess.run(arguments, cwd=folder, check=True, capture_output=True, timeout=60)
+
+    call(*new, "-x509", "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=ca", "-days", "2")
+    for name in ("robot", "guest"):
+        (folder / f"{name}.ext").write_text(
+            "subjectAltName=IP:127.0.0.1\nbasicConstraints=CA:FALSE\n", encoding="ascii"
+        )
+        call(*new, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", f"/CN={name}")
+        signed = ("-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial", "-extfile", f"{name}.ext", "-days", "2")
+        call(openssl, "x509", "-req", "-in", f"{name}.csr", *signed, "-out", f"{name}.pem")
+    return folder
+
+
+def tls(folder: Path, name: str) -> dict[str, Any]:
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate": str(folder / "ca.pem"),
+            "listen_certificate": str(folder / f"{name}.pem"),
+            "listen_private_key": str(folder / f"{name}.key"),
+            "connect_certificate": str(folder / f"{name}.pem"),
+            "connect_private_key": str(folder / f"{name}.key"),
+            "enable_mtls": True,
+        }
+    }
+
+
+@pytest.mark.anyio
+async def test_nobody_joins_over_tls_without_a_certificate(certificates: Path, domain: str) -> None:
+    address = free_address().replace("tcp", "tls")
+    stranger = {"transport/link/tls/root_ca_certificate": str(certificates / "ca.pem")}
+    async with (
+        listening(domain, listen=address, config=tls(certificates, "robot")) as robot,
+        listening(domain, connect=address, config=stranger) as refused,
+        # It comes behind the other and gets in.
+        listening(domain, connect=address, config=tls(certificates, "guest")) as guest,
+    ):
+        await met(robot, guest)
+        await talk(robot, guest)
+    assert refused.items == []
+    assert robot.of(refused) == guest.of(refused) == []
+
+
+def listen_only(name: str) -> dict[str, Any]:
+    """The setting by which those with a certificate of one name are not announced, and publish nothing."""
+    rule = {
+        "id": "saying",
+        "messages": ["put", "delete", "liveliness_token"],
+        "flows": ["ingress"],
+        "permission": "deny",
+        "key_exprs": ["tfbus/**", "tfbus/**/@alive/**"],
+    }
+    return {
+        "access_control": {
+            "enabled": True,
+            "default_permission": "allow",
+            "rules": [rule],
+            "subjects": [{"id": "guests", "cert_common_names": [name]}],
+            "policies": [{"rules": ["saying"], "subjects": ["guests"]}],
+        }
+    }
+
+
+@pytest.mark.anyio
+async def test_access_control_lets_a_guest_hear_and_ask_and_not_publish(certificates: Path, domain: str) -> None:
+    address = free_address().replace("tcp", "tls")
+    async with (
+        ZenohRouter(address, config=tls(certificates, "robot") | listen_only("guest")),
+        listening(domain, connect=address, config=tls(certificates, "robot")) as robot,
+        listening(domain, connect=address, config=tls(certificates, "guest")) as guest,
+    ):
+        await until(lambda: robot.id in guest.present)
+        guest.wire.publish(LIVE, b"fake")
+        assert guest.wire.send(robot.id, b"question")
+        await until(lambda: robot.messages == [(guest.id, b"question")])
+        robot.wire.send(guest.id, b"answer")
+        robot.wire.publish(LIVE, b"published")
+        await until(lambda: len(guest.messages) == 2)
+        assert guest.of(robot) == [Joined(""), b"answer", b"published"]
+    assert robot.items == [(guest.id, b"question")]

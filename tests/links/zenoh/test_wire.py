@@ -1,0 +1,621 @@
+import gc
+import os
+import re
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import AsyncExitStack, contextmanager
+from itertools import product
+from typing import Any
+
+import anyio
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+from support.processes import OPEN_FILES, Program, free_address, until
+from support.zenoh_wires import LIVE, Ear, listening, met, start_router, talk
+
+from tfbus.links.wire import MAX_MESSAGE, Hearing, Joined, Left
+from tfbus.links.zenoh.addresses import client_config, open_client
+from tfbus.links.zenoh.wire import ZenohWire, robots_pattern
+from tfbus.links.zenoh.zenoh_router import ZenohRouter
+from tfbus.tf_message import MalformedMessageError
+
+pytestmark = pytest.mark.anyio
+
+
+# What links say to each other
+
+
+@pytest.mark.every_loop
+async def test_links_meet_and_what_one_publishes_comes_to_all_others(address: str, domain: str) -> None:
+    async with (
+        ZenohRouter(address),
+        listening(domain, "r1", connect=address) as one,
+        listening(domain, "r2", connect=address) as two,
+        listening(domain, connect=address) as three,
+    ):
+        await met(one, two, three)
+        assert three.present == {one.id: "r1", two.id: "r2"}
+        assert one.present == {two.id: "r2", three.id: ""}
+        assert one.wire.publish(LIVE, b"of one")
+        await until(lambda: bool(two.messages and three.messages))
+        assert three.wire.publish(LIVE, b"of three")
+        await until(lambda: len(two.messages) == 2 and bool(one.messages))
+    assert one.messages == [(three.id, b"of three")]
+    assert two.messages == [(one.id, b"of one"), (three.id, b"of three")]
+    assert three.messages == [(one.id, b"of one")]
+
+
+async def test_links_of_other_domains_are_not_there(address: str, domain: str) -> None:
+    async with (
+        ZenohRouter(address),
+        listening(domain, connect=address) as one,
+        listening(f"{domain}/more", connect=address) as more,
+        listening("another", connect=address) as another,
+        listening(domain, connect=address) as two,
+    ):
+        await met(one, two)
+        for ear in (one, more, another):
+            ear.wire.publish(LIVE, ear.id.encode())
+        one.wire.send(two.id, b"end")
+        await until(lambda: (one.id, b"end") in two.messages)
+        assert set(two.present) == {one.id}
+    assert two.messages == [(one.id, one.id.encode()), (one.id, b"end")]
+    assert more.items == another.items == []
+
+
+async def test_the_first_hearing_that_matches_a_robot_says_which_channel_is_heard(address: str, domain: str) -> None:
+    hears = (Hearing("r1", "live"), Hearing("r*", "slow"), Hearing("", "live"))
+    async with (
+        ZenohRouter(address),
+        listening(domain, "r1", connect=address, hears=()) as one,
+        listening(domain, "r22", connect=address, hears=()) as two,
+        listening(domain, connect=address, hears=()) as nameless,
+        listening(domain, "arm", connect=address, hears=()) as arm,
+        listening(domain, "hearer", connect=address, hears=hears) as hearer,
+    ):
+        await until(lambda: len(hearer.present) == 3)
+        senders = (one, two, nameless, arm)
+        for ear, channel in product(senders, ("live", "slow")):
+            ear.wire.publish(channel, channel.encode())
+        for ear in senders:
+            ear.wire.send(hearer.id, b"end")
+        await until(lambda: sum(message == b"end" for _, message in hearer.messages) == 4)
+        assert hearer.of(one) == [Joined("r1"), b"live", b"end"]
+        assert hearer.of(two) == [Joined("r22"), b"slow", b"end"]
+        assert hearer.of(nameless) == [Joined(""), b"live", b"end"]
+        assert hearer.of(arm) == [b"end"], "it is not announced"
+        assert [ear.items for ear in senders] == [[]] * 4, "they hear nobody"
+
+
+async def test_a_message_for_one_link_comes_to_no_other_and_also_to_one_that_does_not_hear_the_sender(
+    address: str, domain: str
+) -> None:
+    async with (
+        ZenohRouter(address),
+        listening(domain, "r1", connect=address) as one,
+        listening(domain, "r2", connect=address, hears=[Hearing("r3", LIVE)]) as deaf,
+        listening(domain, connect=address) as other,
+    ):
+        await until(lambda: set(one.present) == {deaf.id, other.id})
+        assert one.wire.send(deaf.id, b"question")
+        await until(lambda: deaf.messages == [(one.id, b"question")])
+        assert deaf.wire.send(one.id, b"answer")
+        await until(lambda: one.messages == [(deaf.id, b"answer")])
+        assert deaf.present == {}
+    assert other.messages == []
+
+
+async def test_messages_of_both_kinds_come_in_the_order_in_which_they_went(address: str, domain: str) -> None:
+    async with (
+        ZenohRouter(address),
+        listening(domain, connect=address) as one,
+        listening(domain, connect=address) as two,
+    ):
+        await met(one, two)
+        sent = [b"%d" % number * (1 + number % 50 * 40) for number in range(300)]
+        for number, message in enumerate(sent):
+            if number % 3:
+                one.wire.publish(LIVE, message)
+            else:
+                one.wire.send(two.id, message)
+            await anyio.lowlevel.checkpoint()
+        await until(lambda: len(two.messages) == len(sent))
+    assert [message for _, message in two.messages] == sent
+
+
+async def test_large_messages_arrive_whole(address: str, domain: str) -> None:
+    async with (
+        ZenohRouter(address),
+        listening(domain, connect=address) as one,
+        listening(domain, connect=address) as two,
+    ):
+        await met(one, two)
+        message = os.urandom(2**16) * (MAX_MESSAGE // 2**16)
+        one.wire.publish(LIVE, message)
+        await until(lambda: two.messages == [(one.id, message)])
+
+
+async def test_all_that_was_sent_before_the_end_still_goes_out(address: str, domain: str) -> None:
+    async with ZenohRouter(address), listening(domain, connect=address) as stays:
+        async with listening(domain, connect=address) as ends:
+            await met(stays, ends)
+            for number in range(100):
+                ends.wire.publish(LIVE, b"%d" % number)
+        await until(lambda: stays.present == {})
+    assert stays.of(ends) == [Joined(""), *(b"%d" % number for number in range(100)), Left()]
+
+
+@pytest.mark.thorough
+async def test_a_link_knows_whether_anybody_may_hear_a_channel(address: str, domain: str) -> None:
+    async with ZenohRouter(address), listening(domain, connect=address) as one:
+        assert one.wire.publish(LIVE, b"not known yet")
+        await until(lambda: not one.wire.publish(LIVE, b"unheard"))
+        async with listening(domain, connect=address, hears=[Hearing("*", "slow")]) as two:
+            await until(lambda: two.id in one.present)
+            assert not one.wire.publish(LIVE, b"unheard")
+            async with listening(domain, connect=address) as three:
+                await until(lambda: three.id in one.present)
+                assert one.wire.publish(LIVE, b"heard")
+                await until(lambda: bool(three.messages))
+                assert one.wire.publish("slow", b"heard too")
+                await until(lambda: bool(two.messages))
+            await until(lambda: not one.wire.publish(LIVE, b"unheard again"))
+    assert not one.wire.publish(LIVE, b"closed")
+    assert not one.wire.send(two.id, b"closed")
+
+
+async def test_a_link_may_publish_on_any_number_of_channels(address: str, domain: str) -> None:
+    async with (
+        ZenohRouter(address),
+        listening(domain, connect=address) as one,
+        listening(domain, connect=address, hears=[Hearing("*", "c0")]) as two,
+    ):
+        await until(lambda: two.id in one.present and one.id in two.present)
+        for number in (*range(100), 0):
+            one.wire.publish(f"c{number}", b"%d" % number)
+        await until(lambda: two.messages == [(one.id, b"0")] * 2)
+
+
+# Routers that come, go and break
+
+
+@pytest.mark.parametrize("hard", [False, pytest.param(True, marks=pytest.mark.thorough)])
+async def test_all_links_leave_with_the_router_and_join_again_by_its_successor(
+    address: str, domain: str, hard: bool
+) -> None:
+    async with listening(domain, connect=address) as one, listening(domain, connect=address) as two:
+        if hard:
+            with start_router(address) as router:
+                await met(one, two)
+                router.process.kill()
+                await until(lambda: not one.present and not two.present)
+        else:
+            async with ZenohRouter(address):
+                await met(one, two)
+            await until(lambda: not one.present and not two.present)
+        await until(lambda: not one.wire.publish(LIVE, b"to nobody"))
+        assert not one.wire.send(two.id, b"to nobody")
+        async with ZenohRouter(address):
+            await met(one, two)
+            await talk(one, two)
+        assert two.of(one)[:3] == [Joined(""), Left(), Joined("")]
+
+
+async def test_of_several_addresses_the_first_that_answers_is_taken(address: str, domain: str) -> None:
+    dead = free_address()
+    async with (
+        ZenohRouter(address),
+        listening(domain, connect=[dead, address]) as one,
+        listening(domain, connect=[address, dead]) as two,
+    ):
+        await met(one, two)
+        await talk(one, two)
+
+
+async def test_links_of_two_linked_routers_meet_and_go_to_the_other_one_when_theirs_ends(
+    address: str, domain: str
+) -> None:
+    other = free_address()
+    async with AsyncExitStack() as stack, ZenohRouter(other, connect=address):
+        await stack.enter_async_context(ZenohRouter(address))
+        async with (
+            listening(domain, connect=[address, other]) as one,
+            listening(domain, connect=[other, address]) as two,
+        ):
+            await met(one, two)
+            await talk(one, two)
+            await stack.aclose()
+            await until(lambda: Left() in two.of(one))
+            await met(one, two)
+            await talk(one, two)
+
+
+async def test_a_link_that_listens_is_the_router_of_the_others(address: str, domain: str) -> None:
+    async with (
+        listening(domain, "base", listen=address) as base,
+        listening(domain, connect=address) as one,
+        listening(domain, connect=address) as two,
+    ):
+        await met(base, one, two)
+        await talk(base, one, two)
+        assert one.present[base.id] == "base"
+        # It hears only what it means to hear, though all goes through it.
+        two.wire.send(one.id, b"private")
+        await until(lambda: (two.id, b"private") in one.messages)
+    assert (two.id, b"private") not in base.messages
+    assert len(base.of(two)) == base.of(two).index(Left()) + 1
+
+
+async def test_links_that_listen_connect_to_each_other_and_survive_each_other(address: str, domain: str) -> None:
+    other = free_address()
+    async with (
+        listening(domain, listen=other, connect=address) as early,
+        listening(domain, connect=other) as guest,
+    ):
+        for _ in range(2):
+            async with listening(domain, listen=address) as late:
+                await met(early, late, guest)
+                await talk(early, late, guest)
+            await until(lambda: late.id not in guest.present | early.present)
+            await talk(early, guest)
+
+
+async def test_an_address_in_use_is_an_os_error(address: str, domain: str) -> None:
+    async with listening(domain, listen=address):
+        with pytest.raises(OSError, match="in use"):
+            async with listening(domain, listen=address):
+                raise AssertionError("it has opened")
+
+
+@pytest.mark.thorough
+@pytest.mark.every_loop
+async def test_a_link_without_a_router_opens_warns_once_and_connects_when_there_is_one(
+    address: str, domain: str
+) -> None:
+    async with listening(domain, connect=address) as one:
+        await until(lambda: bool(one.warnings))
+        assert address in str(one.warnings[0])
+        assert ".rs:" not in str(one.warnings[0])
+        async with ZenohRouter(address), listening(domain, connect=address) as two:
+            await met(one, two)
+            await talk(one, two)
+    assert len(one.warnings) == 1
+    assert two.warnings == []
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("who", ["the router", "a link", "the router that is also a link"])
+async def test_silence_for_longer_than_the_lease_is_healed(who: str, address: str, domain: str) -> None:
+    routing = {"listen": address} if who == "the router that is also a link" else {"connect": address}
+    with Stoppable() as stop:
+        if who == "the router":
+            stop.add(start_router(address))
+        else:
+            stop.add(Program(sys.executable, "-c", _LINK, domain, *next(iter(routing.items()))))
+        async with AsyncExitStack() as stack:
+            if who == "a link":
+                await stack.enter_async_context(ZenohRouter(address))
+            one = await stack.enter_async_context(listening(domain, connect=address))
+            two = await stack.enter_async_context(listening(domain, connect=address))
+            everybody = 1 if who == "the router" else 2
+            await until(lambda: len(one.present) == len(two.present) == everybody)
+            for _ in range(2):
+                stop.signal(signal.SIGSTOP)
+                await until(lambda: len(one.present) < everybody)
+                stop.signal(signal.SIGCONT)
+                await until(lambda: len(one.present) == len(two.present) == everybody)
+                await talk(one, two)
+                if who != "the router":
+                    await until(new_beat(one))
+
+
+def new_beat(ear: Ear) -> Callable[[], bool]:
+    """Whether the program below has published something since now."""
+    before = len(ear.messages)
+    return lambda: any(message == b"beat" for _, message in ear.messages[before:])
+
+
+class Stoppable:
+    """A process that the test stops and continues."""
+
+    def add(self, program: Program) -> None:
+        self._program = program
+
+    def signal(self, number: signal.Signals) -> None:
+        self._program.process.send_signal(number)
+
+    def __enter__(self) -> "Stoppable":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._program:
+            pass
+
+
+_LINK = """
+import sys, anyio
+from tfbus.links.wire import Hearing
+from tfbus.links.zenoh.wire import ZenohWire
+async def main(domain, which, address):
+    wire = ZenohWire(domain, lease=1.0, **{which: address})
+    await wire.open([Hearing("*", "live")], lambda link, item: None, print)
+    while True:
+        wire.publish("live", b"beat")
+        await anyio.sleep(0.02)
+anyio.run(main, *sys.argv[1:])
+"""
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
+async def test_of_two_linked_routers_one_may_break(fault: signal.Signals, address: str, domain: str) -> None:
+    other = free_address()
+    with start_router(address), start_router(other, address) as second:
+        async with (
+            listening(domain, connect=[address, other]) as one,
+            listening(domain, connect=[other, address]) as two,
+        ):
+            await met(one, two)
+            second.process.send_signal(fault)
+            await until(lambda: Left() in one.of(two))
+            await met(one, two)
+            await talk(one, two)
+            if fault == signal.SIGSTOP:
+                second.process.send_signal(signal.SIGCONT)
+                await talk(one, two)
+
+
+@pytest.mark.thorough
+async def test_a_router_that_is_stopped_holds_nobody_up(address: str, domain: str) -> None:
+    dead = free_address()
+    with start_router(dead) as stopped:
+        stopped.process.send_signal(signal.SIGSTOP)
+        async with (
+            ZenohRouter(address),
+            listening(domain, connect=[dead, address]) as one,
+            listening(domain, connect=address) as two,
+        ):
+            await met(one, two)
+
+
+# The beginning and the end
+
+
+async def test_a_link_needs_the_address_of_a_router(domain: str) -> None:
+    given: list[dict[str, Any]] = [{}, {"connect": None}, {"connect": []}, {"connect": ""}]
+    for options in given:
+        with pytest.raises(ValueError, match=r"connect='tcp/host:7447'.* the local link"):
+            ZenohWire(domain, **options)
+
+
+@pytest.mark.parametrize(
+    ("domain", "robot", "why"),
+    [("", "", "domain"), ("a b", "", "domain"), ("a/*", "", "domain"), ("a", "r/1", "robot"), ("a", "~", "robot")],
+)
+async def test_a_name_that_cannot_be_part_of_a_key_is_refused(domain: str, robot: str, why: str) -> None:
+    with pytest.raises(ValueError, match=f"{why}.* is made of"):
+        ZenohWire(domain, robot, connect="tcp/127.0.0.1:7447")
+
+
+@pytest.mark.parametrize("robots", ["a/b", "~", "**/x", "a" * 201, "$*"])
+async def test_a_pattern_that_no_robot_can_match_is_refused(robots: str, domain: str) -> None:
+    with pytest.raises(ValueError, match="a pattern such as"):
+        async with listening(domain, connect=free_address(), hears=[Hearing(robots, LIVE)]):
+            raise AssertionError("it has opened")
+
+
+async def test_a_wire_that_was_never_opened_can_be_closed(domain: str) -> None:
+    await ZenohWire(domain, connect=free_address()).close()
+
+
+def own_threads() -> int:
+    return sum(thread.name == "tfbus and zenoh end" for thread in threading.enumerate())
+
+
+@contextmanager
+def leaving_nothing() -> Iterator[None]:
+    """Find the threads and open files of this process as they were."""
+    gc.collect()
+    before = own_threads(), len(list(OPEN_FILES.iterdir())) if OPEN_FILES.is_dir() else 0
+    yield
+    assert own_threads() == before[0]
+    if OPEN_FILES.is_dir():
+        assert len(list(OPEN_FILES.iterdir())) <= before[1] + 2
+
+
+@pytest.mark.thorough
+@pytest.mark.every_loop
+async def test_an_opening_that_is_cancelled_at_any_moment_leaves_nothing(address: str, domain: str) -> None:
+    async with ZenohRouter(address), listening(domain, connect=address) as other:
+        async with listening(domain, connect=address) as one:
+            await met(one, other)
+        await until(lambda: not other.present)
+        with leaving_nothing():
+            for tenths in range(60):
+                wire = ZenohWire(domain, connect=address)
+                with anyio.move_on_after(tenths / 10_000) as scope:
+                    await wire.open([Hearing("*", LIVE)], lambda link, item: None, lambda error: None)  # noqa: ARG005
+                    await anyio.sleep_forever()
+                assert scope.cancelled_caught
+                await wire.close()
+            await until(lambda: not other.present)
+
+
+@pytest.mark.thorough
+async def test_a_hundred_links_that_open_and_close_leave_nothing(address: str, domain: str) -> None:
+    async with ZenohRouter(address), listening(domain, connect=address) as other:
+        for many in (3, 100):
+            with leaving_nothing():
+                for _ in range(many):
+                    async with listening(domain, connect=address) as one:
+                        await met(one, other)
+                        one.wire.publish(LIVE, b"x")
+                await until(lambda: not other.present)
+
+
+@pytest.mark.thorough
+async def test_a_link_closes_while_its_router_is_stopped(address: str, domain: str) -> None:
+    with start_router(address) as router:
+        async with listening(domain, connect=address) as one:
+            await until(lambda: one.wire.publish(LIVE, b"x"))
+            router.process.send_signal(signal.SIGSTOP)
+        router.process.send_signal(signal.SIGCONT)
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_child_that_was_forked_from_a_process_that_uses_zenoh_is_told() -> None:
+    program = f"""
+import os, anyio
+from tfbus.links.zenoh.wire import ZenohWire
+async def open_one():
+    wire = ZenohWire("d", connect="{free_address()}")
+    try:
+        await wire.open([], print, print)
+    finally:
+        await wire.close()
+anyio.run(open_one)
+child = os.fork()
+if child == 0:
+    try:
+        anyio.run(open_one)
+    except RuntimeError as error:
+        os._exit(7 if "forked" in str(error) else 8)
+    os._exit(9)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    with Program(sys.executable, "-c", program) as done:
+        assert done.wait() == 0, done.errors.text
+        assert done.output.text.strip() == "7"
+
+
+@pytest.mark.thorough
+async def test_a_program_may_exit_without_closing_its_wire(address: str, domain: str) -> None:
+    program = f"""
+import anyio
+from tfbus.links.wire import Hearing
+from tfbus.links.zenoh.wire import ZenohWire
+async def main():
+    wire = ZenohWire("{domain}", connect="{address}")
+    await wire.open([Hearing("*", "live")], lambda link, item: None, print)
+    wire.publish("live", b"last words")
+anyio.run(main)
+"""
+    async with ZenohRouter(address), listening(domain, connect=address) as one:
+        with Program(sys.executable, "-c", program) as done:
+            assert await anyio.to_thread.run_sync(done.wait) == 0
+            assert done.errors.text == ""
+        await until(lambda: any(isinstance(item, Left) for _, item in one.items))
+
+
+# Strangers
+
+
+@contextmanager
+def stranger(address: str) -> Iterator[zenoh.Session]:
+    """A session of zenoh that says what it likes."""
+    with open_client(client_config(address, None, None), address) as session:
+        yield session
+
+
+def put(session: zenoh.Session, key: str, message: bytes, attachment: bytes | None = None) -> None:
+    session.put(key, message, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK)
+
+
+async def heard_again(ear: Ear, session: zenoh.Session, domain: str, id: str) -> None:  # noqa: A002
+    """Wait until all that a stranger has sent before has come or was refused."""
+    put(session, f"tfbus/{domain}/@to/{ear.id}", b"end", bytes.fromhex(id))
+    await until(lambda: (id, b"end") in ear.messages)
+
+
+ID, OTHER = "0123456789abcdef" * 2, "fedcba9876543210" * 2
+
+
+@pytest.mark.parametrize(
+    "token",
+    [
+        "~/@alive/short/1",
+        f"~/@alive/{ID}/0",
+        f"~/@alive/{ID}/01",
+        f"~/@alive/{ID}/1234567890",
+        f"~/@alive/{ID}/x",
+        f"~/@alive/{ID.upper()}/1",
+        f"{'r' * 201}/@alive/{ID}/1",
+        f"r 1/@alive/{ID}/1",
+        f"é/@alive/{ID}/1",
+    ],
+)
+async def test_a_token_that_no_link_would_make_is_ignored(token: str, address: str, domain: str) -> None:
+    async with ZenohRouter(address), listening(domain, connect=address) as one:
+        with stranger(address) as session:
+            bad = session.liveliness().declare_token(f"tfbus/{domain}/{token}")
+            good = session.liveliness().declare_token(f"tfbus/{domain}/~/@alive/{OTHER}/1")
+            await until(lambda: OTHER in one.present)
+            assert set(one.present) == {OTHER}
+            bad.undeclare()
+            good.undeclare()
+        await until(lambda: not one.present)
+
+
+async def test_a_newer_session_of_a_link_counts_and_an_older_one_no_more(address: str, domain: str) -> None:
+    async with ZenohRouter(address), listening(domain, connect=address) as one:
+        with stranger(address) as session:
+            liveliness = session.liveliness()
+            key = f"tfbus/{domain}/r/@alive/{ID}"
+            second = liveliness.declare_token(f"{key}/2")
+            first = liveliness.declare_token(f"{key}/1")
+            third = liveliness.declare_token(f"{key}/3")
+            second.undeclare()
+            first.undeclare()
+            await heard_again(one, session, domain, ID)
+            assert one.items == [(ID, Joined("r")), (ID, Left()), (ID, Joined("r")), (ID, b"end")]
+            third.undeclare()
+            await until(lambda: not one.present)
+
+
+async def test_what_is_published_by_no_link_that_is_present_is_ignored(address: str, domain: str) -> None:
+    async with ZenohRouter(address), listening(domain, connect=address) as one:
+        with stranger(address) as session:
+            for end in (ID, "x", one.id, ID.upper(), "é" * 100):
+                put(session, f"tfbus/{domain}/~/{LIVE}/{end}", b"garbage")
+            await heard_again(one, session, domain, ID)
+        assert one.items == [(ID, b"end")]
+
+
+@pytest.mark.parametrize("attachment", [None, b"", b"x" * 15, b"x" * 17, b"x" * 100_000])
+async def test_a_message_for_one_link_without_a_sender_is_ignored(
+    attachment: bytes | None, address: str, domain: str
+) -> None:
+    async with ZenohRouter(address), listening(domain, connect=address) as one:
+        with stranger(address) as session:
+            put(session, f"tfbus/{domain}/@to/{one.id}", b"garbage", attachment)
+            await heard_again(one, session, domain, ID)
+        assert one.items == [(ID, b"end")]
+
+
+async def test_a_message_that_is_too_large_is_refused_and_one_that_is_far_too_large_not_even_assembled(
+    address: str, domain: str
+) -> None:
+    async with ZenohRouter(address), listening(domain, connect=address) as one:
+        with stranger(address) as session:
+            key = f"tfbus/{domain}/@to/{one.id}"
+            for size in (MAX_MESSAGE, MAX_MESSAGE + 1, MAX_MESSAGE + 2**18, 5 * MAX_MESSAGE):
+                put(session, key, bytes(size), bytes.fromhex(ID))
+            await heard_again(one, session, domain, ID)
+            kinds = [len(item) if isinstance(item, bytes) else type(item) for _, item in one.items]
+            assert kinds == [MAX_MESSAGE, MalformedMessageError, 3]
+            assert "oversized" in str(one.items[1][1])
+
+
+@given(st.text("ab*", min_size=1, max_size=8), st.text("ab", max_size=8))
+async def test_a_pattern_matches_as_a_plain_regular_expression_does(pattern: str, robot: str) -> None:
+    plain = re.compile(".*".join(map(re.escape, pattern.split("*"))))
+    assert bool(robots_pattern(pattern).fullmatch(robot)) == bool(plain.fullmatch(robot))
+
+
+async def test_a_name_that_almost_matches_a_pattern_of_many_stars_takes_no_time() -> None:
+    assert not robots_pattern("*a" * 100 + "*b").fullmatch("a" * 199 + "c")

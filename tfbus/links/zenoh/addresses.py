@@ -1,0 +1,156 @@
+"""The settings of a zenoh session, above all its addresses; and its beginning."""
+
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+import zenoh
+
+from tfbus.links.wire import MAX_MESSAGE
+from tfbus.links.zenoh._closing import use_zenoh
+from tfbus.stamps import as_duration
+
+LEASE: Final = 4.0
+"""s of silence after which the other end takes a session for lost."""
+SIGNS_OF_LIFE: Final = 4
+"""So many go out in each lease, so one may be late by three quarters of it."""
+OPENING_TIME: Final = 2.0
+"""s; a router that has not answered by then is passed over for the next one."""
+UNSENT: Final = 8
+"""So many buffers of 64 KiB may wait for the router before messages are dropped; zenoh's two are full whenever its
+thread waits for a CPU for some ms."""
+LONGEST_NAME: Final = 200
+
+Addresses = str | Iterable[str]
+
+_ON_NETWORK = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[^\]]+\]|[^:/?#\s]+):(?P<port>\d{1,5})([?#].*)?")
+_ON_MACHINE = re.compile(r"(unixsock-stream|unixpipe|serial|vsock)/.+")
+# Each session draws its own id, and the arguments say the rest.
+_NOT_TO_SET = re.compile("id|mode|listen|listen/endpoints.*|connect|connect/endpoints.*")
+
+
+def router_config(
+    listen: Addresses, connect: Addresses, config: Mapping[str, Any] | None, lease: float | None
+) -> zenoh.Config:
+    """The settings of a router, which keeps trying to reach all other routers in `connect`; raises as `client_config`.
+
+    Parameters
+    ----------
+    listen, connect : str or iterable of str
+        zenoh's endpoints, such as ``tcp/192.168.1.5:7447``.
+    config, lease
+        As for `client_config`.
+    """
+    values = {
+        "mode": "router",
+        "listen/endpoints": endpoints(listen),
+        "connect/endpoints": endpoints(connect),
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        # It would wait so long for routers that scouting finds.
+        "scouting/delay": 0,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1_000, "period_increase_factor": 2},
+    }
+    return _config(values, config, lease)
+
+
+def client_config(connect: Addresses, config: Mapping[str, Any] | None, lease: float | None) -> zenoh.Config:
+    """The settings of a client of any of some routers.
+
+    Parameters
+    ----------
+    connect : str or iterable of str
+        zenoh's endpoints, such as ``tcp/192.168.1.5:7447``.
+    config : mapping of str to any, or None
+        zenoh's own settings by their path, such as ``transport/link/tls/root_ca_certificate``; they override all
+        others.
+    lease : float or None
+        Seconds of silence after which the other end takes this one for lost; each end announces its own. None is for
+        `LEASE`.
+
+    Raises
+    ------
+    ValueError
+        If an address is malformed, zenoh refuses a setting or its value, or `lease` is not positive and finite.
+    TypeError
+        If an argument has another type.
+    """
+    values = {"mode": "client", "connect/endpoints": endpoints(connect), "connect/timeout_ms": 0}
+    return _config(values, config, lease)
+
+
+def _config(values: dict[str, Any], config: Mapping[str, Any] | None, lease: float | None) -> zenoh.Config:
+    silence = LEASE if lease is None else as_duration(lease, "lease")
+    if not 0 < silence < math.inf:
+        raise ValueError(f"lease must be a time that passes, got {lease}")
+    own = dict(config or {})
+    for path in own:
+        if _NOT_TO_SET.fullmatch(path):
+            raise ValueError(f"zenoh's setting {path!r} is not for config: give addresses by connect and listen")
+    values |= {
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/unicast/open_timeout": round(OPENING_TIME * 1_000),
+        "transport/link/tx/lease": max(1, round(silence * 1_000)),
+        "transport/link/tx/keep_alive": SIGNS_OF_LIFE,
+        "transport/link/tx/queue/size/data": UNSENT,
+        # It would leave a file open for each link that has ended.
+        "transport/shared_memory/enabled": False,
+        # Larger messages are not even assembled; zenoh adds a key and some headers to each.
+        "transport/link/rx/max_message_size": MAX_MESSAGE + 2**17,
+    }
+    result = zenoh.Config()
+    for path, value in (values | own).items():
+        try:
+            result.insert_json5(path, json.dumps(value))
+        except (zenoh.ZError, TypeError) as error:
+            why = _without_source_location(error)
+            raise ValueError(f"zenoh does not take {value!r} for its setting {path!r}: {why}") from None
+    return result
+
+
+def open_client(config: zenoh.Config, address: str) -> zenoh.Session:
+    """Open a session with one of the routers of `client_config`; raises as `open_session`."""
+    config.insert_json5("connect/endpoints", json.dumps([address]))
+    return open_session(config)
+
+
+def open_session(config: zenoh.Config) -> zenoh.Session:
+    """Open a session; blocks.
+
+    Raises
+    ------
+    OSError
+        If it cannot listen where it should, or as a client reaches nobody; with its `errno`, if there is one.
+    RuntimeError
+        If this process was forked from one that uses zenoh.
+    """
+    use_zenoh()
+    try:
+        return zenoh.open(config)
+    except BaseException as error:  # It panics at some addresses, such as tcp/host:7447?rel=3.
+        raise os_error(error, "zenoh cannot open a session") from error
+
+
+def os_error(error: BaseException, what: str) -> OSError:
+    """An error of zenoh as the operating system's, with its `errno` if it names one."""
+    text = f"{what}: {_without_source_location(error)}"
+    number = re.search(r"\(os error (\d+)\)", text)
+    return OSError(int(number[1]), text) if number else OSError(text)
+
+
+def endpoints(addresses: Addresses) -> list[str]:
+    """One address or several, each checked; raises `ValueError`."""
+    found = [addresses] if isinstance(addresses, str) else list(addresses)
+    for address in found:
+        # zenoh accepts some that it can never reach, and would try for ever.
+        on_network = _ON_NETWORK.fullmatch(address)
+        if not (int(on_network["port"]) < 2**16 if on_network else _ON_MACHINE.fullmatch(address)):
+            raise ValueError(f"an address is like tcp/192.168.1.5:7447, not {address!r}")
+    return found
+
+
+def _without_source_location(error: BaseException) -> str:
+    return re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).strip()

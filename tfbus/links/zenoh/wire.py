@@ -1,0 +1,471 @@
+"""The wire beyond one machine: each link is one client session of a zenoh router, and another one when it breaks.
+
+Keys, where *robot* is ``~`` for a link without one, *link* is 32 hexadecimal digits that each link draws at random, and
+*n* counts the sessions of a link from 1::
+
+    tfbus/domain/robot/channel/link     what a link publishes; subscribed by those that hear the channel of the robot
+    tfbus/domain/@to/link               what others send to a link; subscribed by it alone. The attachment is the
+                                        sender's id as 16 bytes
+    tfbus/domain/robot/@alive/link/n    a liveliness token for each session of a link, declared when it hears all
+
+Who dials whom: a link dials a router, the first of its addresses that answers within `OPENING_TIME`. Links never dial
+each other. With ``listen`` a link's own session is a router; it dials the other routers, and never breaks.
+
+Present: a link is present while the token of its newest known session is seen. A new session of a present link is told
+as `Left` and `Joined`, because messages may have been lost between them. The token of an older session means nothing
+any more, whenever it goes. When the own session breaks, all links have left, and join again by the next one. A router
+notices by end of file that a process has died, and by silence for a lease that it is cut off or stopped; a link notices
+the same of its router, by the lease that the router announces.
+
+Bounds: a message has at most `MAX_MESSAGE` bytes; `UNSENT` buffers of 64 KiB wait for the router, what finds no room is
+dropped, and no call waits for room longer than zenoh's 50 ms, once each time that the network becomes congested;
+`MAX_LINKS` others are present at once; `MAX_CHANNELS` channels have a publisher.
+
+Both kinds of messages have one priority, because zenoh keeps the order only within one.
+
+Access control by a router's rules: ``put`` and ``delete`` on ``tfbus/**`` are what a link publishes,
+``liveliness_token`` on ``tfbus/**/@alive/**`` is that it is announced, and ``put`` on ``tfbus/**/@to/*`` what it sends
+to one link. In zenoh ``**`` stands for no part that begins with ``@``. The id of a sender proves nothing.
+"""
+
+import math
+import os
+import re
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from random import uniform
+from time import monotonic
+from typing import Any, Final
+
+import anyio
+import zenoh
+
+from tfbus._aio.loops import LoopWaker
+from tfbus.links.wire import MAX_MESSAGE, Hearing, Joined, Left, Receive
+from tfbus.links.zenoh._closing import Keeper, begin_to_close, close_session
+from tfbus.links.zenoh.addresses import (
+    LONGEST_NAME,
+    Addresses,
+    client_config,
+    endpoints,
+    open_client,
+    open_session,
+    os_error,
+    router_config,
+)
+from tfbus.tf_message import MalformedMessageError
+
+MAX_LINKS: Final = 10_000
+MAX_CHANNELS: Final = 32
+FIRST_WAIT: Final = 1.0
+"""s; `ZenohWire.open` waits so long for a router."""
+SETTLED: Final = 1.0
+"""s after which a router has told a new publisher who subscribes to it."""
+PAUSE: Final = (0.2, 0.6)
+"""s between two attempts to reach any router; drawn at random, because a router that starts again has many clients."""
+NO_ROBOT: Final = "~"
+
+_NAME = re.compile(r"[\w.-]+", re.ASCII)
+_TOKEN = re.compile(
+    rf"(?P<robot>~|[\w.-]{{1,{LONGEST_NAME}}})/@alive/(?P<link>[0-9a-f]{{32}})/(?P<number>[1-9]\d{{0,8}})", re.ASCII
+)
+_DROP, _REMOTE = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE
+_Heard = tuple[str, re.Pattern[str], str]
+"""A `Hearing`: the robots as an expression of zenoh and as a regular one, and the channel."""
+
+
+class ZenohWire:
+    """A `tfbus.links.wire.Wire` over zenoh's routers.
+
+    Parameters
+    ----------
+    domain : str
+        Only links of one domain hear each other.
+    robot : str
+        The name of the robot; empty for a link without one.
+    connect : str or iterable of str, optional
+        The addresses of routers, such as ``tcp/192.168.1.5:7447``. They are tried in turn until one answers, and again
+        when the session with it breaks. With `listen` the router of this process connects to all of them.
+    listen : str or iterable of str, optional
+        Run a router in this process that listens there.
+    config : mapping of str to any, optional
+        Settings of zenoh by their path: TLS, access control.
+    lease : float, optional
+        Seconds of silence after which the other end takes this one for lost; by default `addresses.LEASE`.
+
+    Raises
+    ------
+    ValueError
+        If a name or an address is malformed, there is no address, or zenoh does not take a setting.
+    TypeError
+        If an argument has another type.
+    """
+
+    def __init__(
+        self,
+        domain: str,
+        robot: str = "",
+        *,
+        connect: Addresses | None = None,
+        listen: Addresses | None = None,
+        config: Mapping[str, Any] | None = None,
+        lease: float | None = None,
+    ) -> None:
+        self.id = os.urandom(16).hex()
+        self._domain = f"tfbus/{check_domain(domain)}"
+        self._own = f"{self._domain}/{check_robot(robot) if robot else NO_ROBOT}"
+        self._addresses = deque(endpoints(connect or ()))
+        self._is_router = listen is not None
+        if listen is not None:
+            self._config = router_config(listen, self._addresses, config, lease)
+        elif self._addresses:
+            self._config = client_config(self._addresses, config, lease)
+        else:
+            raise ValueError(
+                "a link over zenoh needs a router: connect='tcp/host:7447' is the address of one, and "
+                "listen='tcp/0.0.0.0:7447' makes this process one; the processes of one machine need none, and meet by "
+                "the local link"
+            )
+        self._session: _Session | None = None
+        self._number = 0
+        self._keeper = Keeper(self._keep)
+        self._failure: OSError | None = None
+
+    async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
+        """See `tfbus.links.wire.Wire`. It waits a second for a router, and warns later if there is none.
+
+        Raises
+        ------
+        OSError
+            If it is to listen, and cannot.
+        ValueError
+            If no robot can have a name that the link means to hear.
+        RuntimeError
+            If this process was forked from one that uses zenoh.
+        """
+        self._hears = [(robots_expression(robots), robots_pattern(robots), channel) for robots, channel in hears]
+        self._receive, self._warn = receive, warn
+        self._tried = anyio.Event()
+        self._waker = LoopWaker(self._tell)
+        self._waker.bind()
+        self._keeper.start()
+        with anyio.move_on_after(math.inf if self._is_router else FIRST_WAIT):
+            await self._tried.wait()
+        if self._is_router and self._failure is not None:
+            raise self._failure
+
+    async def run(self) -> None:
+        """See `tfbus.links.wire.Wire`. A thread of the wire does what takes time, because zenoh's calls block."""
+        await anyio.sleep_forever()
+
+    def publish(self, channel: str, message: bytes) -> bool:
+        """See `tfbus.links.wire.Wire`."""
+        session = self._session
+        return session is not None and session.publish(channel, message)
+
+    def send(self, link: str, message: bytes) -> bool:
+        """See `tfbus.links.wire.Wire`. It is false while no router is connected, and goes in the order of all."""
+        session = self._session
+        return session is not None and session.send(f"{self._domain}/@to/{link}", message)
+
+    async def close(self) -> None:
+        """See `tfbus.links.wire.Wire`. It warns if zenoh goes on closing in the background."""
+        late = await self._keeper.end()
+        if late is not None:
+            self._warn(late)
+
+    def _tell(self) -> None:
+        """Let `open` return, and warn; on the event loop."""
+        self._tried.set()
+        if not self._is_router and not self._keeper.stopped and self._failure is not None:
+            failure, self._failure = self._failure, None
+            self._warn(failure)
+
+    # The thread that opens and closes sessions
+
+    def _keep(self) -> None:
+        """Have one session after another, until the wire is closed."""
+        channels: list[str] = []
+        while (session := self._connect(channels)) is not None:
+            self._wake()
+            while not (self._keeper.stopped or session.hearer.broken):
+                self._keeper.changed.wait()
+                self._keeper.changed.clear()
+            self._session = None
+            channels = session.channels
+            if self._keeper.stopped:
+                close_session(session)
+                return
+            session.hearer.end()
+            begin_to_close(session)
+            self._addresses.rotate(-1)
+
+    def _connect(self, channels: Iterable[str]) -> "_Session | None":
+        """Try one router after the other until one answers; None if the wire is closed, or cannot listen."""
+        since: float | None = monotonic()
+        while True:
+            for _ in range(max(1, len(self._addresses))):
+                if self._keeper.stopped:
+                    return None
+                try:
+                    return self._connect_once(channels)
+                except OSError as error:
+                    failure = error
+                self._addresses.rotate(-1)
+            if self._is_router:
+                self._failure = failure
+            elif since is not None and monotonic() > since + FIRST_WAIT:
+                since = None
+                where = ", ".join(sorted(self._addresses))
+                self._failure = OSError(f"no zenoh router answers at {where}, and the link goes on trying: {failure}")
+            self._wake()
+            if self._is_router:
+                return None
+            self._keeper.changed.wait(uniform(*PAUSE))
+            self._keeper.changed.clear()
+
+    def _connect_once(self, channels: Iterable[str]) -> "_Session":
+        self._number += 1
+        raw = open_session(self._config) if self._is_router else open_client(self._config, self._addresses[0])
+        hearer = _Hearer(self.id, self._domain, self._hears, self._receive, self._keeper.changed)
+        session = _Session(raw, hearer, self._own, self.id)
+        try:
+            for channel in channels:
+                session.declare(channel)
+            # The owner may send something to a link as soon as that has joined.
+            self._session = session
+            session.begin(self._domain, self._number, self._hears, breaks=not self._is_router)
+        except zenoh.ZError as error:
+            self._session = None
+            hearer.end()
+            begin_to_close(session)
+            raise os_error(error, "the session with a router broke at once") from error
+        return session
+
+    def _wake(self) -> None:
+        # The event loop may have ended.
+        with suppress(RuntimeError):
+            self._waker.wake()
+
+
+class _Session:
+    """One session of a link: what it declares, and what goes out by it."""
+
+    def __init__(self, session: zenoh.Session, hearer: "_Hearer", own: str, link: str) -> None:
+        self.hearer = hearer
+        self._session = session
+        self._own = own
+        self._link = link
+        self._sender = bytes.fromhex(link)
+        self._publishers: dict[str, tuple[zenoh.Publisher, float]] = {}
+        self._declared: list[object] = []
+
+    @property
+    def channels(self) -> list[str]:
+        return list(self._publishers)
+
+    def begin(self, domain: str, number: int, hears: Sequence[_Heard], *, breaks: bool) -> None:
+        """Hear others, and then be present; raises `zenoh.ZError`."""
+        session, hearer, declared = self._session, self.hearer, self._declared
+        if breaks:
+            declared.append(session.info.declare_transport_events_listener(_directly(hearer.take_event)))
+        for index, (robots, _, channel) in enumerate(hears):
+            take = _directly(partial(hearer.take_published, index))
+            key = f"{domain}/{robots}/{channel}/*"
+            declared.append(session.declare_subscriber(key, take, allowed_origin=_REMOTE))
+        take = _directly(hearer.take_sent)
+        declared.append(session.declare_subscriber(f"{domain}/@to/{self._link}", take, allowed_origin=_REMOTE))
+        liveliness = session.liveliness()
+        for index, (robots, _, _) in enumerate(hears):
+            take = _directly(partial(hearer.take_token, index))
+            declared.append(liveliness.declare_subscriber(f"{domain}/{robots}/@alive/*/*", take, history=True))
+        declared.append(liveliness.declare_token(f"{self._own}/@alive/{self._link}/{number}"))
+        if breaks and not session.info.transports():
+            # It broke before anybody listened.
+            hearer.broken = True
+
+    def declare(self, channel: str) -> tuple[zenoh.Publisher, float]:
+        """A new publisher for a channel, and since when it is there."""
+        if len(self._publishers) >= MAX_CHANNELS:
+            del self._publishers[next(iter(self._publishers))]
+        key = f"{self._own}/{channel}/{self._link}"
+        publisher = self._session.declare_publisher(key, congestion_control=_DROP, allowed_destination=_REMOTE)
+        self._publishers[channel] = publisher, monotonic()
+        return self._publishers[channel]
+
+    def publish(self, channel: str, message: bytes) -> bool:
+        try:
+            publisher, since = self._publishers.get(channel) or self.declare(channel)
+            publisher.put(message)
+            return bool(publisher.matching_status.matching) or monotonic() < since + SETTLED  # type: ignore[attr-defined]
+        except zenoh.ZError:
+            # The session has just ended.
+            return False
+
+    def send(self, key: str, message: bytes) -> bool:
+        try:
+            self._session.put(
+                key, message, attachment=self._sender, congestion_control=_DROP, allowed_destination=_REMOTE
+            )
+        except zenoh.ZError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close the session; blocks."""
+        for publisher, _ in list(self._publishers.values()):
+            # Otherwise zenoh keeps 13 kB of each for ever.
+            with suppress(zenoh.ZError):
+                publisher.undeclare()
+        try:
+            self._session.close()
+        finally:
+            # The garbage collector does not see through zenoh's objects.
+            self._declared.clear()
+            self._publishers.clear()
+
+
+class _Hearer:
+    """Takes all that comes by one session, in zenoh's threads; it holds none of zenoh's objects, which hold it."""
+
+    def __init__(
+        self, link: str, domain: str, hears: Sequence[_Heard], receive: Receive, changed: threading.Event
+    ) -> None:
+        self.broken = False
+        self._link = link
+        self._rest = len(domain) + 1
+        self._patterns = [pattern for _, pattern, _ in hears]
+        self._receive = receive
+        self._changed = changed
+        self._lock = threading.Lock()
+        self._ended = False
+        # The number of the newest session of each link that is present, and which of `hears` is for it.
+        self._present: dict[str, tuple[int, int]] = {}
+
+    def take_published(self, index: int, sample: zenoh.Sample) -> None:
+        link = str(sample.key_expr).rpartition("/")[2]
+        with self._lock:
+            known = self._present.get(link)
+            if known is not None and known[1] == index:
+                self._receive(link, _content(sample))
+
+    def take_sent(self, sample: zenoh.Sample) -> None:
+        sender = b"" if sample.attachment is None or len(sample.attachment) != 16 else sample.attachment.to_bytes()
+        with self._lock:
+            if sender and not self._ended:
+                self._receive(sender.hex(), _content(sample))
+
+    def take_token(self, index: int, sample: zenoh.Sample) -> None:
+        found = _TOKEN.fullmatch(str(sample.key_expr), self._rest)
+        if found is None or found["link"] == self._link:
+            return
+        link, number = found["link"], int(found["number"])
+        robot = found["robot"] if found["robot"] != NO_ROBOT else ""
+        if index != next((place for place, pattern in enumerate(self._patterns) if pattern.fullmatch(robot)), None):
+            return
+        with self._lock:
+            known = self._present.get(link)
+            if sample.kind == zenoh.SampleKind.DELETE:
+                if known is not None and known[0] == number:
+                    del self._present[link]
+                    self._receive(link, Left())
+            elif self._ended or (known[0] >= number if known is not None else len(self._present) >= MAX_LINKS):
+                return
+            else:
+                if known is not None:
+                    self._receive(link, Left())
+                self._present[link] = number, index
+                self._receive(link, Joined(robot))
+
+    def take_event(self, event: zenoh.TransportEvent) -> None:
+        if event.kind == zenoh.SampleKind.DELETE:
+            self.broken = True
+            self._changed.set()
+
+    def end(self) -> None:
+        """Have all links leave, and take nothing any more; in any thread."""
+        with self._lock:
+            self._ended = True
+            for link in self._present:
+                self._receive(link, Left())
+            self._present.clear()
+
+
+def _directly(callback: Callable[[Any], object]) -> Any:
+    """A handler that zenoh's threads call; whatever a stranger's message makes of it, no error leaves it."""
+
+    def call(thing: Any) -> None:
+        with suppress(Exception):
+            callback(thing)
+
+    # Otherwise each subscriber has a thread of its own, and one overtakes the other.
+    return zenoh.handlers.Callback(call, indirect=False)
+
+
+def _content(sample: zenoh.Sample) -> bytes | MalformedMessageError:
+    size = len(sample.payload)
+    if size > MAX_MESSAGE:
+        return MalformedMessageError("oversized", f"{size} bytes, and {MAX_MESSAGE} are allowed")
+    return sample.payload.to_bytes()
+
+
+# Names in keys
+
+
+def check_domain(domain: str) -> str:
+    """Return a domain.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be part of a key.
+    """
+    if len(domain) > LONGEST_NAME or not re.fullmatch(rf"{_NAME.pattern}(/{_NAME.pattern})*", domain, re.ASCII):
+        raise ValueError(
+            "a domain is made of letters, digits, '-', '_' and '.', with '/' between them, "
+            f"{LONGEST_NAME} at most, not {domain!r}"
+        )
+    return domain
+
+
+def check_robot(robot: str) -> str:
+    """Return the name of a robot.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be part of a key.
+    """
+    if len(robot) > LONGEST_NAME or not _NAME.fullmatch(robot):
+        raise ValueError(
+            f"a robot's name is made of letters, digits, '-', '_' and '.', {LONGEST_NAME} at most, not {robot!r}"
+        )
+    return robot
+
+
+def robots_expression(robots: str) -> str:
+    """The key expression for the robots of a pattern, in which ``*`` stands for any letters.
+
+    Raises
+    ------
+    ValueError
+        If no name of a robot can match it.
+    """
+    if not robots:
+        return NO_ROBOT
+    if len(robots) > LONGEST_NAME or not re.fullmatch(r"[\w.*-]+", robots, re.ASCII):
+        raise ValueError(f"the name of a robot, or a pattern such as 'r*', is needed, not {robots!r}")
+    collapsed = re.sub(r"\*+", "*", robots)
+    return collapsed if collapsed == "*" else collapsed.replace("*", "$*")
+
+
+def robots_pattern(robots: str) -> re.Pattern[str]:
+    """The same as a regular expression, which takes no longer for the names that strangers choose."""
+    first, *rest = map(re.escape, robots.split("*"))
+    if not rest:
+        return re.compile(first)
+    # Each part may stand where it first occurs, so nothing is ever tried again.
+    return re.compile(first + "".join(f"(?>.*?{part})" for part in rest[:-1]) + f".*{rest[-1]}")

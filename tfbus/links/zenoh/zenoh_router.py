@@ -1,0 +1,89 @@
+"""A zenoh router in this process, which links and other routers connect to."""
+
+import threading
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Final, Self
+
+import anyio
+import anyio.to_thread
+
+from tfbus.links.zenoh._closing import Keeper, close_session
+from tfbus.links.zenoh.addresses import Addresses, open_session, router_config
+
+ROUTER: Final = "tcp/127.0.0.1:17447"
+"""The address of a router that is given none: only processes of this machine reach it."""
+
+
+class ZenohRouter:
+    """Passes on what links send each other: ``async with ZenohRouter("tcp/192.168.1.5:7447")``.
+
+    It has no bus, knows no domains, and passes on only what a link behind it, or behind another router, has subscribed
+    to. Routers that are connected are as one; each link needs one of them.
+
+    Parameters
+    ----------
+    listen : str or iterable of str
+        zenoh's endpoints; by default `ROUTER`.
+    connect : str or iterable of str, optional
+        The addresses of other routers.
+    config : mapping of str to any, optional
+        Settings of zenoh by their path: TLS, access control.
+    lease : float, optional
+        Seconds of silence after which the router is taken for lost, and so the time in which links notice that they are
+        cut off from it; by default `tfbus.links.zenoh.addresses.LEASE`.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If zenoh does not take an address or a setting, or an argument has another type.
+    OSError
+        On entering, if it cannot listen where it should.
+    RuntimeError
+        On entering a second time.
+    """
+
+    def __init__(
+        self,
+        listen: Addresses = ROUTER,
+        *,
+        connect: Addresses | None = None,
+        config: Mapping[str, Any] | None = None,
+        lease: float | None = None,
+    ) -> None:
+        self._config = router_config(listen, connect or (), config, lease)
+        self._keeper = Keeper(self._keep)
+        self._entered = False
+        self._opened = threading.Event()
+        self._failure: OSError | None = None
+
+    async def __aenter__(self) -> Self:
+        if self._entered:
+            raise RuntimeError("a router is entered once: make another one")
+        self._entered = True
+        self._keeper.start()
+        try:
+            await anyio.to_thread.run_sync(self._opened.wait, abandon_on_cancel=True)
+            if self._failure is not None:
+                raise self._failure
+        except BaseException:
+            await self._keeper.end()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        await self._keeper.end()
+
+    def _keep(self) -> None:
+        try:
+            session = open_session(self._config)
+        except OSError as error:
+            self._failure = error
+            return
+        finally:
+            self._opened.set()
+        while not self._keeper.stopped:
+            self._keeper.changed.wait()
+        close_session(session)
