@@ -17,7 +17,6 @@ from tfbus import (
     SECOND,
     Buffer,
     Bus,
-    ExplainedEdge,
     Explanation,
     FutureExtrapolationError,
     GapError,
@@ -62,15 +61,6 @@ def robot() -> TransformTree:
 # One edge
 
 
-def test_an_edge_has_the_samples_around_the_stamp_and_the_fraction_between_them() -> None:
-    tree = tree_of(*over("map", "a", (100, 200, 300)))
-    assert tree.explain("map", "a", 250).edges == (
-        ExplainedEdge("map", "a", False, 200, 300, 0.5, 0, 300, 0.0, 2 / (200 / SECOND)),
-    )
-    assert tree.explain("map", "a", 200).edges[0].before == tree.explain("map", "a", 200).edges[0].after == 200
-    assert tree.explain("map", "a", 200).edges[0].fraction == 0.0
-
-
 def test_between_samples_of_two_parents_the_fraction_is_zero() -> None:
     tree = tree_of(moving("map", "a", 100), moving("odom", "a", 200), static("map", "odom"))
     (edge,) = tree.explain("map", "a", 175).edges
@@ -90,18 +80,6 @@ def test_ages_are_counted_from_the_newest_stamp_in_the_tree_or_from_a_given_one(
 
 
 # The whole path
-
-
-def test_every_edge_that_does_not_cover_the_stamp_has_its_error() -> None:
-    tree = tree_of(*over("map", "a", (10, 20)), *over("a", "b", (30, 40)), *over("b", "c", (10, 40)))
-    found = tree.explain("map", "c", 25)
-    assert [type(edge.error) for edge in found.edges] == [
-        FutureExtrapolationError,
-        PastExtrapolationError,
-        type(None),
-    ]
-    assert found.errors == (found.edges[0].error, found.edges[1].error)
-    assert (found.answerable, found.stamp) == (False, None)
 
 
 def test_for_latest_every_edge_that_lags_behind_the_oldest_common_stamp_has_an_error() -> None:

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.asking import threads_that
 from support.samples import moving, over, static, tree_of
-from support.strategies import TODAY, small_angles, transforms, unit_vectors
+from support.strategies import TODAY, transforms
 
 import tfbus
 from tfbus import (
@@ -32,10 +32,8 @@ from tfbus import (
     TransformTree,
     UnknownFrameError,
 )
-from tfbus.rows import Vector
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.tree.history import FrameHistory
-from tfbus.tree.lookup_many import OutOfRange, Segments
+from tfbus.tree.lookup_many import OutOfRange
 
 FRAMES = "rsabcdef"
 ROOTS = 2
@@ -213,16 +211,6 @@ def test_the_error_has_the_index_and_the_facts_of_the_first_stamp_without_an_ans
     text = "stamps[17]: frame 'b': asked for 1.000 s, oldest sample is 2.000 s (1 s too early)"
     assert str(caught.value) == text
     assert (caught.value.oldest, caught.value.newest) == (2 * SECOND, 12 * SECOND)
-
-
-@few_and_many
-def test_an_edge_without_samples_covers_no_stamp(asked: Asked) -> None:
-    tree = tree_of(*over("a", "b", [0, 10]), static("b", "c"))
-    tree.clear()
-    with pytest.raises(FutureExtrapolationError) as caught:
-        tree.lookup_many("a", "c", asked([5]))
-    assert (caught.value.index, caught.value.child, caught.value.newest) == (0, "b", None)
-    assert not tree.lookup_many("a", "c", asked([5]), out_of_range="nan").valid.any()
 
 
 # Time travel
@@ -568,83 +556,6 @@ def test_the_answers_have_the_stamps_that_were_asked_and_slices_and_masks_keep_t
     travelled = tree.lookup_many("map", "base", [3, 4], source_at=np.datetime64(5, "ns"), fixed="map")
     assert travelled.stamps is not None
     assert travelled.stamps.tolist() == [3, 4]
-
-
-def turned_frame(poses: Iterable[tuple[int, Transform]], parents: Sequence[str] = ("parent",)) -> FrameHistory:
-    """A moving frame; its samples name the parents in turn."""
-    made = FrameHistory("child", parents[0], static=False, keep=None)
-    for number, (stamp, pose) in enumerate(poses):
-        made.insert(parents[number % len(parents)], stamp, (*pose.translation, *pose.rotation), "")
-    return made
-
-
-def curve(frame: FrameHistory, stamps: Sequence[int]) -> Segments:
-    return Segments(frame.samples_between(min(stamps), max(stamps)), np.array(stamps, np.int64))
-
-
-def at(frame: FrameHistory, stamps: Sequence[int]) -> list[list[float]]:
-    """The row at each stamp. Asked alone and all together, because the curve is prepared otherwise."""
-    alone = [np.array(curve(frame, [stamp]).at(slice(None))).T[0] for stamp in stamps]
-    asked = [*stamps] * (len(frame) + 1)
-    together = np.array(curve(frame, asked).at(slice(0, len(stamps)))).T
-    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-13)
-    rows: list[list[float]] = together.tolist()
-    return rows
-
-
-def near(row: object, tolerance: float = 1e-12) -> object:
-    return pytest.approx(row, rel=0, abs=tolerance)
-
-
-@st.composite
-def drawn_frames(draw: st.DrawFn) -> FrameHistory:
-    """One to eight samples, packed or far apart anywhere in time, with one parent or with several."""
-    first, step = draw(st.sampled_from([(0, 1), (0, 10), (TODAY, SECOND // 10), (STAMP_MIN, 2**61), (STAMP_MAX, -3)]))
-    numbers = draw(st.lists(st.integers(0, 7), min_size=1, max_size=8, unique=True))
-    poses = draw(st.lists(transforms(10.0), min_size=1, max_size=len(numbers)))
-    parents = draw(st.sampled_from([("p",), ("p", "q"), ("p", "p", "q")]))
-    placed = ((number, poses[place * len(poses) // len(numbers)]) for place, number in enumerate(numbers))
-    return turned_frame([(first + number * step, pose) for number, pose in placed], parents)
-
-
-@given(drawn_frames(), st.data())
-def test_a_curve_equals_the_history_at_every_stamp(frame: FrameHistory, data: st.DataObject) -> None:
-    known = [frame.sample(i)[0] for i in range(frame.count)]
-    low, high = known[0], known[-1]
-    inside = st.integers(low, high) | st.sampled_from(known)
-    beside = st.sampled_from(known).map(lambda stamp: min(max(stamp + 1, low), high))
-    stamps = data.draw(st.lists(inside | beside, min_size=1, max_size=12))
-    for stamp, row in zip(stamps, at(frame, stamps), strict=True):
-        assert row == near(frame.row_at(stamp))
-
-
-@given(st.lists(transforms(), min_size=1, max_size=5))
-def test_the_row_at_the_stamp_of_a_sample_is_the_sample_bit_for_bit(poses: list[Transform]) -> None:
-    rows = at(turned_frame(enumerate(poses)), range(len(poses)))
-    assert rows == [[*pose.translation, *pose.rotation] for pose in poses]
-
-
-@given(unit_vectors(), st.floats(-3.1, 3.1) | small_angles(), st.sampled_from([1.0, -1.0]))
-def test_the_angle_of_an_interpolated_turn_is_linear_in_time_for_any_angle_and_sign(
-    axis: Vector, angle: float, sign: float
-) -> None:
-    turned = Transform.from_axis_angle(axis, angle, (8.0, 0.0, -4.0))
-    last = Transform(turned.translation, [sign * part for part in turned.rotation])
-    quarters = at(turned_frame([(0, Transform()), (4, last)]), range(4))
-    for quarter, row in enumerate(quarters):
-        expected = Transform.from_axis_angle(axis, angle * quarter / 4, (2.0 * quarter, 0.0, -1.0 * quarter))
-        assert row == near([*expected.translation, *expected.rotation], 1e-15 + 1e-9 * abs(angle))
-
-
-def test_half_a_turn_has_the_direction_of_the_sign_of_the_second_quaternion() -> None:
-    for w in (1e-17, -1e-17):
-        frame = turned_frame([(0, Transform()), (2, Transform(rotation=(0.0, 0.0, 1.0, w)))])
-        assert at(frame, [1])[0][5] == pytest.approx(math.copysign(math.sqrt(0.5), w))
-
-
-def test_parents_that_differ_in_the_last_character_are_different() -> None:
-    frame = turned_frame([(0, Transform()), (10, Transform((10.0, 0.0, 0.0)))], ["odom", "odom\0"])
-    assert at(frame, [9])[0][0] == 0.0
 
 
 @pytest.mark.skipif(tfbus.kernel != "compiled", reason="numpy's sine may differ from that of the kernel in Python")

@@ -66,19 +66,6 @@ def test_poses_of_turned_frames_with_stamps_of_their_own_are_those_of_lookups(
             check_against_lookups(tree, reader.read(fixed, at), fixed, at)
 
 
-def test_poses_of_a_frame_with_two_parents_are_those_of_lookups_at_every_stamp() -> None:
-    tree = tree_of(
-        *over("map", "odom", (0, 9)),
-        *(moving("map", "base", stamp, 2.0 + stamp) for stamp in (1, 3)),
-        *(moving("odom", "base", stamp, 7.0 + stamp) for stamp in (5, 8)),
-        static("base", "lidar", 1.0),
-    )
-    reader = PoseReader(forest_of(tree))
-    for fixed in tree.frames():
-        for at in (*range(11), LATEST):
-            check_against_lookups(tree, reader.read(fixed, at), fixed, at)
-
-
 def test_an_edge_without_a_sample_at_the_stamp_keeps_its_nearest_one() -> None:
     tree = tree_of(*over("map", "base", (10, 20)), static("base", "lidar", 1.0))
     late = read(tree, "map", 25)
@@ -136,17 +123,6 @@ def test_a_sample_that_has_left_the_window_is_not_heard() -> None:
     tree = tree_of(moving("map", "base", 0), keep=1.0)
     tree.insert(moving("map", "base", 2 * SECOND))
     assert read(tree, "map", SECOND).heard.tolist() == [STAMP_MIN, STAMP_MIN]
-
-
-def test_a_reader_follows_frames_that_are_added_reparented_and_removed() -> None:
-    tree = tree_of(static("map", "a", 1.0), static("a", "b", 1.0))
-    reader = PoseReader(forest_of(tree))
-    assert x_in(reader.read("map"), "b") == 2.0
-    tree.insert(static("map", "b", 5.0))
-    tree.insert(static("b", "c", 1.0))
-    assert x_in(reader.read("map"), "c") == 6.0
-    tree.remove_frame("a")
-    assert set(reader.read("map").frames) == {"map", "b", "c"}
 
 
 CHANGES = st.one_of(any_samples("abcd", last=10), st.sampled_from("abcd"), st.none())

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import moving, static
-from support.strategies import TODAY, angles, rotations, stamps, transforms, unit_vectors
+from support.strategies import TODAY, stamps, transforms
 
 from tfbus import (
     LATEST,
@@ -88,49 +88,6 @@ def test_a_body_on_the_unit_circle_has_the_textbook_velocity(time: float) -> Non
     twist = tree.twist("body", "map", round(time * SECOND))
     check_twist(twist, (-math.sin(time), math.cos(time), 0.0), Z)
     assert (twist.frame, twist.stamp) == ("map", round(time * SECOND))
-
-
-@pytest.mark.parametrize(
-    ("frame", "axes", "linear"),
-    [
-        ("body", "map", (-math.sin(1.0), math.cos(1.0), 0.0)),
-        ("body", "body", (0.0, 1.0, 0.0)),
-        ("ahead", "map", (-2.0 * math.sin(1.0), 2.0 * math.cos(1.0), 0.0)),
-    ],
-)
-def test_twists_are_exact_where_lookup_velocity_of_tf2_is_wrong(frame: str, axes: str, linear: Vector) -> None:
-    tree = tree_of(
-        *trajectory("map", "arm", turning(1.0)),
-        placed("arm", "body", (1.0, 0.0, 0.0)),
-        placed("body", "ahead", (1.0, 0.0, 0.0)),
-    )
-    check_twist(tree.twist(frame, "map", SECOND, expressed_in=axes), linear, Z)
-
-
-@given(
-    rotations(),
-    unit_vectors(),
-    angles().filter(lambda angle: abs(angle) < math.pi - 1e-9),
-    st.booleans(),
-    st.floats(0.01, 0.99),
-)
-def test_a_turn_has_a_constant_rate_in_the_parent_for_any_quaternion_signs(
-    start: Quaternion, axis: Vector, angle: float, flipped: bool, fraction: float
-) -> None:
-    first = Transform(rotation=start)
-    x, y, z, w = (Transform.from_axis_angle(axis, angle) @ first).rotation
-    second = Transform(rotation=(-x, -y, -z, -w) if flipped else (x, y, z, w))
-    tree = tree_of(TransformStamped("map", "body", 0, first), TransformStamped("map", "body", SECOND, second))
-    check_twist(tree.twist("body", "map", round(fraction * SECOND)), STILL, times(angle, axis), tolerance=1e-12)
-
-
-@given(rotations(), unit_vectors())
-def test_a_half_turn_has_the_direction_of_the_interpolation(start: Quaternion, axis: Vector) -> None:
-    first = Transform(rotation=start)
-    second = Transform.from_axis_angle(axis, math.pi) @ first
-    tree = tree_of(TransformStamped("map", "body", 0, first), TransformStamped("map", "body", SECOND, second))
-    _, angular = difference(tree, "body", "map", SECOND // 2)
-    check_twist(tree.twist("body", "map", SECOND // 2), STILL, angular, tolerance=1e-6)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
