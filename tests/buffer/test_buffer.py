@@ -1,11 +1,13 @@
 import logging
 import math
+import re
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import anyio
 import anyio.lowlevel
+import numpy as np
 import pytest
 from support.asking import Asked, HandClock, driving, settle
 from support.samples import moving, static
@@ -20,6 +22,7 @@ from tfbus import (
     ClockResetError,
     DisconnectedError,
     FutureExtrapolationError,
+    LaserScan,
     LookupTimeoutError,
     PastExtrapolationError,
     PointStamped,
@@ -580,24 +583,11 @@ async def test_transform_to_another_stamp_passes_timeout_and_max_age_on() -> Non
         await buffer.transform(point, "base", max_age=1.0, at=2 * SECOND, fixed="map")
 
 
-@pytest.mark.parametrize(
-    ("data", "arguments", "message"),
-    [
-        (("laser", 0), {}, r"@do_transform\.register"),
-        (PointStamped("laser", 0, (0.0, 0.0, 0.0)), {"at": 5}, "at and fixed go together"),
-        (PointStamped("laser", 0, (0.0, 0.0, 0.0)), {"fixed": "map"}, "at and fixed go together"),
-    ],
-)
-async def test_wrong_data_or_arguments_of_transform_raise_before_anything_is_awaited(
-    data: Any, arguments: dict[str, Any], message: str
-) -> None:
-    _, _, buffer = make()
-    with anyio.CancelScope() as scope:
-        scope.cancel()
-        with pytest.raises(TypeError, match=message):
-            await buffer.transform(data, "map", **arguments)
-    with pytest.raises(TypeError, match=message):
-        buffer.transform_nowait(data, "map", **arguments)
+class Smell:
+    """Data with a frame and a stamp, of a type that is not registered."""
+
+    frame = "map"
+    stamp = LATEST
 
 
 class Message:
@@ -606,18 +596,52 @@ class Message:
     header = ("base", 0)
 
 
-@do_transform.register
-def _(data: Message, transform: TransformStamped) -> Message:
+class Note:
+    """Registered data with a frame, but no stamp."""
+
+    frame = "map"
+
+
+@do_transform.register(Note)
+@do_transform.register(Message)
+def _(data: Any, transform: TransformStamped) -> Any:
     assert transform.child == "base"
     return data
+
+
+POINT = PointStamped("laser", 0, (0.0, 0.0, 0.0))
+SCAN = LaserScan("laser", 2, np.array([4.0]), angle_min=0.0, angle_increment=0.0)
+
+
+@pytest.mark.parametrize(
+    ("data", "arguments", "message"),
+    [
+        (Smell(), {}, "@do_transform.register(Smell)"),
+        (("laser", 0), {}, "@do_transform.register(tuple)"),
+        (SCAN, {}, "transform its to_points() instead"),
+        (Message(), {}, "a Message has no frame and stamp of its own: look the transform up and call do_transform"),
+        (Note(), {}, "a Note has no frame and stamp of its own"),
+        (POINT, {"at": 5}, "at and fixed go together"),
+        (POINT, {"at": LATEST}, "at and fixed go together"),
+        (POINT, {"fixed": "map"}, "at and fixed go together"),
+    ],
+)
+async def test_wrong_data_or_arguments_of_transform_raise_before_anything_is_awaited(
+    data: Any, arguments: dict[str, Any], message: str
+) -> None:
+    _, _, buffer = make()
+    with anyio.CancelScope() as scope:
+        scope.cancel()
+        with pytest.raises(TypeError, match=re.escape(message)):
+            await buffer.transform(data, "map", **arguments)
+    with pytest.raises(TypeError, match=re.escape(message)):
+        buffer.transform_nowait(data, "map", **arguments)
 
 
 async def test_registered_data_without_frame_and_stamp_are_transformed_by_an_answer_of_lookup() -> None:
     _, bus, buffer = make()
     bus.publish(static("map", "base"))
     message = Message()
-    with pytest.raises(TypeError, match="look the transform up and call do_transform"):
-        await buffer.transform(message, "map")  # type: ignore[type-var]
     assert do_transform(message, await buffer.lookup("map", "base")) is message
 
 
