@@ -18,7 +18,6 @@ from tfbus import (
     Buffer,
     BufferStatistics,
     Bus,
-    DisconnectedError,
     InvalidTransformError,
     SimulatedClock,
     TransformLookupError,
@@ -283,15 +282,6 @@ def test_only_the_prefilled_edges_in_the_loop_are_removed() -> None:
     assert [(edge.parent, edge.child) for edge in late.tree.edges()] == [("r", "a"), ("c", "b"), ("b", "d")]
 
 
-def test_samples_of_a_prefill_that_are_ahead_of_the_bus_give_way_when_the_bus_reparents() -> None:
-    bus = bus_with([moving("a", "x", 50)])
-    late = Buffer(bus, prefill=tree_of(*over("a", "x", (50, 90)), keep=None))
-    bus.publish(moving("a", "x", 60))
-    assert late.tree.edges()[0].newest == 90
-    bus.publish(moving("b", "x", 70))
-    assert [(edge.parent, edge.newest) for edge in late.tree.edges()] == [("b", 70)]
-
-
 @pytest.mark.parametrize("heard", [89, 90, 91])
 def test_samples_of_a_prefill_stay_when_the_bus_reparents_later_than_them(heard: int) -> None:
     bus = bus_with([moving("a", "x", 50)])
@@ -398,12 +388,3 @@ def check_no_loop(parents: dict[str, str]) -> None:
 
 TestLateBuffers = LateBuffers.TestCase
 TestLateBuffers.settings = settings(stateful_step_count=25)
-
-
-def test_a_loop_that_a_late_buffer_would_have_held_is_none_for_any_question() -> None:
-    bus = bus_with([moving("a", "x", 5)])
-    late = Buffer(bus)
-    bus.publish([moving("x", "b", 6), moving("b", "x", 4)])
-    with pytest.raises((DisconnectedError, UnknownFrameError)):
-        late.lookup_nowait("a", "b")
-    assert late.explain("x", "b").answerable

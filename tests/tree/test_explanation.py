@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from support.samples import any_samples, moving, over, static, tree_of
+from support.samples import any_samples, moving, static, tree_of
 
 from tfbus import (
     LATEST,
@@ -19,11 +19,9 @@ from tfbus import (
     Bus,
     Explanation,
     FutureExtrapolationError,
-    GapError,
     Hold,
     InvalidTransformError,
     Latest,
-    PastExtrapolationError,
     SimulatedClock,
     TransformLookupError,
     TransformStamped,
@@ -82,21 +80,6 @@ def test_ages_are_counted_from_the_newest_stamp_in_the_tree_or_from_a_given_one(
 # The whole path
 
 
-def test_for_latest_every_edge_that_lags_behind_the_oldest_common_stamp_has_an_error() -> None:
-    tree = tree_of(*over("map", "a", (1, 10)), *over("a", "b", (1, 20)), *over("b", "c", (30, 40)))
-    found = tree.explain("map", "c")
-    lagging = [("a", 30, 1, 10), ("b", 30, 1, 20)]
-    for error, facts_of_edge in zip(found.errors, lagging, strict=True):
-        assert isinstance(error, FutureExtrapolationError)
-        assert (error.child, error.stamp, error.oldest, error.newest) == facts_of_edge
-    assert isinstance(found.errors[0].__cause__, PastExtrapolationError)
-    assert [(edge.before, edge.after) for edge in found.edges] == [(10, 10), (1, 20), (None, 30)]
-    # Within the tolerance, a sample may stand in.
-    for tolerance, blocking in ((9, ["a", "b"]), (10, ["a"]), (19, ["a"])):
-        errors = tree.explain("map", "c", tolerance=tolerance * NANO).errors
-        assert [error.child for error in errors if isinstance(error, FutureExtrapolationError)] == blocking
-
-
 def test_for_an_answer_that_is_too_old_every_edge_that_is_too_old_has_an_error() -> None:
     found = robot().explain("map", "gripper", not_before=from_seconds(12.495))
     assert [edge.child for edge in found.edges if edge.error is not None] == ["odom", "arm"]
@@ -127,21 +110,6 @@ def test_a_loop_in_the_past_is_shown_once() -> None:
     assert found.half_chains == (("x", "other"), ("a", "b", "a"))
     assert [(edge.parent, edge.child) for edge in found.edges] == [("other", "x"), ("b", "a"), ("a", "b")]
     assert "up from 'a' to 'a'" in str(found)
-
-
-def test_under_a_policy_each_edge_has_its_extrapolation_or_error() -> None:
-    tree = tree_of(*over("map", "a", (100, 200)), *over("a", "b", (100, 180)), *over("b", "c", (100, 300)))
-    question: dict[str, Any] = {"extrapolate": Hold(40 * NANO), "max_gap": 100 * NANO}
-    found = tree.explain("map", "c", 220, **question)
-    assert [(edge.fraction, edge.extrapolated_by, edge.error is None) for edge in found.edges] == [
-        (0.0, 20, True),
-        (0.0, 40, True),
-        (None, 0, False),
-    ]
-    assert isinstance(found.errors[0], GapError)
-    assert tree.explain("map", "a", 220, **question).stamp == 220
-    (edge,) = tree.explain("map", "a", 90, tolerance=10 * NANO).edges
-    assert (edge.fraction, edge.extrapolated_by) == (1.0, 10)
 
 
 @pytest.mark.parametrize("at", [1.5, None, True])

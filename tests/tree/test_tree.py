@@ -75,9 +75,6 @@ def test_inserting_anything_but_samples_is_a_type_error_and_stores_nothing(sampl
     assert tree.frames() == []
 
 
-# Loops
-
-
 # Frames and edges
 
 
