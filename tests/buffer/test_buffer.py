@@ -274,26 +274,6 @@ async def test_a_lookup_with_max_age_waits_for_a_sample_that_is_recent_enough() 
 # Waking
 
 
-def waiting(bus: Bus) -> int:
-    """The number of parked lookups; a woken one is not parked until its task runs and it waits again."""
-    return bus.statistics().buffers[0].waiting
-
-
-@pytest.mark.parametrize("source", ["edge", "nowhere", "elsewhere"], ids=["too old", "unknown", "disconnected"])
-async def test_cancelled_lookups_leave_no_waiters_for_any_error(source: str) -> None:
-    _, bus, buffer = make()
-    bus.publish([driving("map", "edge", 0), driving("moon", "elsewhere", 0)])
-    async with anyio.create_task_group() as tasks:
-        for k in range(100):
-            tasks.start_soon(buffer.lookup, "map", source, SECOND + k % 10)
-        await settle()
-        assert waiting(bus) == 100
-        tasks.cancel_scope.cancel()
-    assert waiting(bus) == 0
-    assert buffer.pending() == ()
-    assert "waiting" not in buffer.describe()
-
-
 @pytest.mark.parametrize("data_first", [True, False])
 async def test_a_lookup_cancelled_and_woken_in_one_turn_leaves_no_waiter(data_first: bool) -> None:
     _, bus, buffer = make()

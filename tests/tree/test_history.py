@@ -50,31 +50,18 @@ def test_the_fast_path_for_the_next_sample_equals_an_insertion(
                 assert quick.row_at(at) == slow.row_at(at)
 
 
-@pytest.mark.thorough
-def test_a_million_samples_take_no_more_than_the_window_and_its_slack() -> None:
-    samples = history(keep=1_000, stamps=[0])
-    pose = row(1.0)
-    largest = 0
-    for stamp in range(1, 1_000_001):
-        samples.append("parent", stamp, pose, "")
-        largest = max(largest, held(samples))
-    assert largest < 1_150
-
-
-def test_the_window_applies_to_earlier_stamps_after_a_clear() -> None:
-    samples = history(keep=1_000, stamps=[10**6])
+@pytest.mark.parametrize("parents", [1, 2])
+@pytest.mark.parametrize(
+    "count", [pytest.param(1_000_000, marks=pytest.mark.thorough), 10_000], ids=["a million", "ten thousand"]
+)
+def test_samples_take_no_more_memory_than_the_window_and_its_slack_also_after_a_clear(count: int, parents: int) -> None:
+    samples = history(keep=1_000, stamps=[10**7])
     samples.clear()
-    for stamp in range(10_000):
-        samples.insert("parent", stamp, row(1.0), "")
+    pose = row(1.0)
+    for stamp in range(count):
+        samples.insert(f"parent {stamp % parents}", stamp, pose, "")
         assert held(samples) < 1_150
-
-
-def test_alternating_parents_take_no_more_memory_than_the_window() -> None:
-    samples = history(keep=1_000, stamps=[0])
-    for stamp in range(1, 20_000):
-        samples.insert(f"parent {stamp % 2}", stamp, row(0.0), "")
-        assert held(samples) < 1_150
-    assert set(samples.named_parents) == {"parent 0", "parent 1"}
+    assert set(samples.named_parents) == {f"parent {number}" for number in range(parents)}
 
 
 # What many lookups take

@@ -23,7 +23,6 @@ from tfbus import (
     DisconnectedError,
     FutureExtrapolationError,
     Latest,
-    PastExtrapolationError,
     PointCloud,
     Transform,
     TransformArray,
@@ -199,18 +198,6 @@ def test_a_stamp_before_the_window_is_out_of_range(asked: Asked) -> None:
     tree = tree_of(*over("a", "b", range(166)), keep=160e-9)
     found = tree.lookup_many("a", "b", asked([4, 5, 165]), out_of_range="nan")
     assert found.valid[:3].tolist() == [False, True, True]
-
-
-@pytest.mark.parametrize("repeat", [1, 20])
-def test_the_error_has_the_index_and_the_facts_of_the_first_stamp_without_an_answer(repeat: int) -> None:
-    tree = tree_of(*over("a", "b", [2 * SECOND, 12 * SECOND]))
-    stamps = [5 * SECOND] * 17 + [SECOND, 13 * SECOND, 0] * repeat
-    with pytest.raises(PastExtrapolationError) as caught:
-        tree.lookup_many("a", "b", stamps)
-    assert caught.value.index == 17
-    text = "stamps[17]: frame 'b': asked for 1.000 s, oldest sample is 2.000 s (1 s too early)"
-    assert str(caught.value) == text
-    assert (caught.value.oldest, caught.value.newest) == (2 * SECOND, 12 * SECOND)
 
 
 # Time travel

@@ -49,11 +49,6 @@ def test_the_text_has_a_line_with_the_facts_of_each_frame() -> None:
     ]
 
 
-def test_ages_are_counted_from_now_if_it_is_given() -> None:
-    assert "age 500 ms" in describe([MOVING], now=4_500_000_000)
-    assert "age 0 ns" in describe([MOVING])
-
-
 def test_a_branch_that_continues_is_drawn_beside_its_descendants() -> None:
     picture = describe([edge("map", "a"), edge("a", "b"), edge("map", "c")])
     assert picture.split("\n") == ["map", "├── a      static", "│   └── b  static", "└── c      static"]
@@ -251,13 +246,6 @@ def test_dot_with_a_stamp_shows_all_facts_in_the_colour_of_the_state() -> None:
     assert to_dot(EDGES, None, {"base_link": 0.012}) == to_dot(EDGES)
 
 
-def test_the_dot_of_a_tree_takes_a_stamp() -> None:
-    tree = TransformTree()
-    tree.insert(TransformStamped("map", "base", SECOND, Transform()))
-    assert r"age 2 s" in tree.to_dot(3 * SECOND)
-    assert "age" not in tree.to_dot()
-
-
 TWO_EDGES = [
     Edge("map", "base", False, 101, 2 * SECOND, 4 * SECOND, "odometry"),
     Edge("base", "lidar", True, 1, None, None, "driver"),
@@ -303,10 +291,6 @@ def test_names_and_authorities_cannot_become_elements() -> None:
     html = to_html([Edge(evil, f"{evil}2", False, 1, 0, 0, evil)], 0)
     assert "<script" not in html
     assert html.count("&lt;script&gt;") == 3
-
-
-def test_an_empty_tree_has_a_text() -> None:
-    assert plain(to_html([], 0)) == ["(no frames)"]
 
 
 def test_the_legend_names_every_state_in_its_colour() -> None:
