@@ -115,7 +115,7 @@ def test_a_late_buffer_with_prefill_answers_as_an_early_one(
     assert counted.offered == counted.inserted + counted.replaced + counted.expired
 
 
-# What is taken over
+# The prefill and the samples of the bus
 
 
 def test_latched_samples_of_the_bus_are_inserted_after_the_prefill() -> None:
@@ -178,7 +178,7 @@ def bus_with(*batches: list[TransformStamped]) -> Bus:
     return bus
 
 
-# What is superseded
+# Superseded samples
 
 
 def test_a_late_sample_with_an_old_parent_is_not_the_newest_of_a_buffer_that_missed_the_new_one() -> None:
@@ -227,7 +227,7 @@ def test_a_removed_frame_and_a_jump_back_of_the_clock_supersede_nothing() -> Non
     assert bus.statistics().buffers[0].superseded == 0
 
 
-# What a prefill contradicts
+# Contradictions between a prefill and the bus
 
 
 def test_a_prefilled_frame_with_another_newest_parent_than_on_the_bus_is_left_out() -> None:

@@ -163,7 +163,7 @@ def test_a_matrix_within_one_percent_is_projected_on_a_rotation(a: Transform, sc
     assert math.hypot(*t.rotation) == pytest.approx(1.0, abs=1e-15)
 
 
-# What is not a transform
+# Wrong numbers
 
 
 BAD_NUMBERS = [math.nan, math.inf, -math.inf]

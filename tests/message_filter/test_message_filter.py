@@ -117,7 +117,7 @@ def put(streams: Streams, *messages: Scan) -> None:
         streams.send.send_nowait(message)
 
 
-# What tf2 tests of its own filter
+# The tests of tf2's own filter
 
 
 async def test_a_message_in_the_target_frame_is_delivered_without_transforms(buffer: Buffer, streams: Streams) -> None:

@@ -64,7 +64,7 @@ def test_samples_take_no_more_memory_than_the_window_and_its_slack_also_after_a_
     assert set(samples.named_parents) == {f"parent {number}" for number in range(parents)}
 
 
-# What many lookups take
+# Samples between two stamps
 
 
 def test_samples_between_have_their_authorities_as_long_as_there_are_several_in_the_window() -> None:
@@ -75,7 +75,7 @@ def test_samples_between_have_their_authorities_as_long_as_there_are_several_in_
     assert (taken.parents, taken.authorities) == (None, ["first", "second", "second"])
     samples.insert("parent", 40, row(0.0), "second")
     assert samples.samples_between(10, 40).authorities is None
-    assert taken.authorities == ["first", "second", "second"], "those that were taken stay"
+    assert taken.authorities == ["first", "second", "second"], "the samples that were taken stay as they were"
 
 
 STAMPS = st.integers(0, 20)

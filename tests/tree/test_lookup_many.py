@@ -2,10 +2,13 @@
 
 import math
 import struct
+import sys
 from array import array
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import cycle, islice
+from itertools import count, cycle, islice
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -564,3 +567,32 @@ def test_source_at_without_fixed_and_fixed_without_source_at_are_type_errors(que
         with pytest.raises(TypeError, match="source_at and fixed go together"):
             tree.lookup_many("a", "b", [5], **question)
         assert len(tree.lookup_many("a", "b", [5])) == 1
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda tree, stamps: tree.lookup_many("map", "lidar", stamps),
+        lambda tree, stamps: tree.lookup_many("map", "lidar", stamps, tolerance=1.0),
+        lambda tree, stamps: tree.lookup_many("map", "guest", stamps),
+        lambda tree, stamps: tree.deskew(scan(np.zeros((len(stamps), 3)), stamps, 500), "map", "map"),
+    ],
+    ids=["plain", "policy", "two parents", "cloud"],
+)
+def test_another_thread_can_insert_before_each_call_of_numpy(ask: Callable[[TransformTree, Any], object]) -> None:
+    tree = tree_of(*over("map", "cart", range(0, 1_001, 10)), static("cart", "lidar"), keep=None)
+    tree.insert_many([*over("cart", "guest", range(0, 500, 10)), *over("map", "guest", range(500, 1_001, 10))])
+    stamps, inserted = np.arange(1_000), count()
+
+    def insert(_frame: FrameType, event: str, function: Any) -> None:
+        owner = getattr(function, "__self__", None)
+        if event == "c_call" and (isinstance(owner, np.ndarray) or "numpy" in str(function.__module__)):
+            other.submit(tree.insert, moving("elsewhere", "other", next(inserted))).result(10.0)
+
+    with ThreadPoolExecutor(1) as other:
+        sys.setprofile(insert)
+        try:
+            ask(tree, stamps)
+        finally:
+            sys.setprofile(None)
+    assert next(inserted) > 3

@@ -1,4 +1,4 @@
-"""Closed forms rest on what is exact under the interpolation: straight lines, and steady turns about a fixed axis."""
+"""Twists of motions that the interpolation follows exactly, such as lines and steady turns, and against differences."""
 
 import math
 from collections.abc import Callable

@@ -250,7 +250,7 @@ def test_with_and_without_the_feed_the_same_lookups_are_woken_with_the_same_answ
 ) -> None:
     plays = [Play(keep, feeds) for feeds in (True, False)]
     for play in plays:
-        # Then most of what is drawn continues these edges.
+        # So most drawn samples continue these edges.
         play.insert([("map", child, 1, False) for child in FED_FRAMES])
     for name, *arguments in steps:
         for play in plays:
