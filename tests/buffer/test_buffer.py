@@ -513,9 +513,13 @@ class Note:
     frame = "map"
 
 
-@do_transform.register(Note)
-@do_transform.register(Message)
-def _(data: Any, transform: TransformStamped) -> Any:
+@do_transform.register
+def _(data: Note, transform: TransformStamped) -> Note:
+    raise AssertionError(f"nothing moves {data!r} by {transform}")
+
+
+@do_transform.register
+def _(data: Message, transform: TransformStamped) -> Message:
     assert transform.child == "base"
     return data
 

@@ -203,6 +203,16 @@ def test_a_stamp_before_the_window_is_out_of_range(asked: Asked) -> None:
     assert found.valid[:3].tolist() == [False, True, True]
 
 
+@few_and_many
+def test_an_edge_without_samples_covers_no_stamp(asked: Asked) -> None:
+    tree = tree_of(*over("a", "b", [0, 10]), static("b", "c"))
+    tree.clear()
+    with pytest.raises(FutureExtrapolationError) as caught:
+        tree.lookup_many("a", "c", asked([5]))
+    assert (caught.value.index, caught.value.child, caught.value.newest) == (0, "b", None)
+    assert not tree.lookup_many("a", "c", asked([5]), out_of_range="nan").valid.any()
+
+
 # Time travel
 
 

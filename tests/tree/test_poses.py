@@ -66,6 +66,19 @@ def test_poses_of_turned_frames_with_stamps_of_their_own_are_those_of_lookups(
             check_against_lookups(tree, reader.read(fixed, at), fixed, at)
 
 
+def test_poses_of_a_frame_with_two_parents_are_those_of_lookups_at_every_stamp() -> None:
+    tree = tree_of(
+        *over("map", "odom", (0, 9)),
+        *(moving("map", "base", stamp, 2.0 + stamp) for stamp in (1, 3)),
+        *(moving("odom", "base", stamp, 7.0 + stamp) for stamp in (5, 8)),
+        static("base", "lidar", 1.0),
+    )
+    reader = PoseReader(forest_of(tree))
+    for fixed in tree.frames():
+        for at in (*range(11), LATEST):
+            check_against_lookups(tree, reader.read(fixed, at), fixed, at)
+
+
 def test_an_edge_without_a_sample_at_the_stamp_keeps_its_nearest_one() -> None:
     tree = tree_of(*over("map", "base", (10, 20)), static("base", "lidar", 1.0))
     late = read(tree, "map", 25)
