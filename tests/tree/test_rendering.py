@@ -13,6 +13,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from IPython.core.formatters import HTMLFormatter
 from support.samples import moving, static, tree_of
 from support.strategies import TODAY, frame_names
 
@@ -298,9 +299,15 @@ def test_the_legend_names_every_state_in_its_colour() -> None:
         assert f'color: {state.value}">\u25cf {state.name.lower()}<' in legend()
 
 
+def in_a_notebook(value: object) -> str:
+    """The page that a notebook shows for a value."""
+    html: str = HTMLFormatter()(value)
+    return html
+
+
 def test_a_tree_in_a_notebook_counts_ages_from_its_newest_stamp() -> None:
     tree = tree_of(moving("map", "base", 5 * SECOND), moving("map", "arm", 3 * SECOND))
-    html = tree._repr_html_()
+    html = in_a_notebook(tree)
     assert "age 0 ns" in html
     assert "age 2 s" in html
     assert "static" in html
@@ -310,7 +317,7 @@ def test_a_buffer_in_a_notebook_has_its_own_names_and_ages_by_the_clock() -> Non
     bus = Bus(SimulatedClock(9 * SECOND))
     with Buffer(bus, prefix="robot1/") as buffer:
         bus.publish([moving("robot1/map", "robot1/base", 5 * SECOND), static("robot1/base", "lidar")])
-        html = buffer._repr_html_()
+        html = in_a_notebook(buffer)
     assert ">base<" in html
     assert "age 4 s" in html
 

@@ -417,8 +417,3 @@ def test_a_parent_that_only_deleted_samples_name_is_forgotten() -> None:
     tree = tree_of(moving("map", "base", 1), moving("odom", "base", 5), keep=None)
     tree.forget_before(5)
     assert tree.frames() == ["base", "odom"]
-
-
-def test_the_tree_of_a_buffer_loses_samples_by_itself_only() -> None:
-    with Bus() as bus, Buffer(bus) as buffer, pytest.raises(RuntimeError, match="a bus feeds this tree"):
-        buffer.tree.forget_before(1)

@@ -12,7 +12,6 @@ from support.samples import moving, static
 from tfbus import (
     LATEST,
     Edge,
-    FutureExtrapolationError,
     Question,
     TransformLookupError,
     UnknownFrameError,
@@ -65,20 +64,6 @@ def test_an_expired_sample_of_a_frame_that_is_static_by_the_end_of_its_batch_is_
     live.insert((moving("map", "a", 100), moving("map", "b", 100)))
     live.insert((moving("map", "a", 1), moving("map", "b", 1), static("map", "b")))
     assert (live.statistics(5).expired, live.expired_ahead) == (2, 1)
-
-
-def test_another_question_of_a_waiter_that_becomes_hopeless_wakes_it() -> None:
-    live = live_tree(10e-9)
-    live.insert((moving("map", "a", 0), moving("map", "b", 0), moving("map", "b", 9)))
-    woken: list[str] = []
-    with pytest.raises(FutureExtrapolationError) as caught:
-        tree_over(live).lookup("map", "a", 5)
-    others = (Question("map", "b", 5),)
-    live.park(Waiter(Question("map", "a", 5), 0, partial(woken.append, "a"), others), caught.value)
-    live.insert((moving("map", "b", 10),))
-    assert woken == []
-    live.insert((moving("map", "b", 11),))
-    assert woken == ["a"]
 
 
 class CountedFrames(dict[str, FrameHistory]):
