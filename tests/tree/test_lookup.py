@@ -1,9 +1,7 @@
 """Lookups at the door of the tree; `test_tree_model.py` holds all that a model of plain lists can tell."""
 
 import inspect
-import math
 import pickle
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,72 +10,13 @@ from support.samples import moving, over, static, tree_of, x_of
 
 from tfbus import (
     LATEST,
-    SECOND,
     Buffer,
     FutureExtrapolationError,
-    Transform,
-    TransformStamped,
     TransformTree,
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.testing import assert_close
 from tfbus.tree.lookup import Bounds, Extrapolation, Policy, find
 from tfbus.tree.tree import forest_of
-
-# Time travel
-
-
-# A carriage climbs at 0.5 m/s; on it an arm of 2 m turns at 0.3 rad/s: its tip moves on a helix
-
-
-def carriage(seconds: float) -> Transform:
-    return Transform((0.0, 0.0, 0.5 * seconds))
-
-
-def hub(seconds: float) -> Transform:
-    return Transform.from_axis_angle((0, 0, 1), 0.3 * seconds)
-
-
-def tip_in_world(seconds: float) -> Transform:
-    angle = 0.3 * seconds
-    centre = (2.0 * math.cos(angle), 2.0 * math.sin(angle), 0.5 * seconds)
-    return Transform.from_axis_angle((0, 0, 1), angle, centre)
-
-
-@pytest.fixture
-def helix() -> TransformTree:
-    tree = TransformTree(keep=None)
-    for second in range(21):
-        tree.insert(TransformStamped("world", "carriage", second * SECOND, carriage(second)))
-        tree.insert(TransformStamped("carriage", "hub", second * SECOND, hub(second)))
-    tree.insert(TransformStamped("hub", "tip", 0, Transform((2.0, 0.0, 0.0)), static=True))
-    return tree
-
-
-@pytest.mark.parametrize("seconds", [0.0, 0.25, 7.5, 19.875, 20.0])
-def test_the_tip_of_the_arm_moves_on_a_helix(helix: TransformTree, seconds: float) -> None:
-    at = int(seconds * SECOND)
-    assert_close(helix.lookup("world", "tip", at), tip_in_world(seconds))
-    assert_close(helix.lookup("tip", "world", at), tip_in_world(seconds).inverse())
-
-
-@pytest.mark.parametrize(("then", "now"), [(2.5, 11.25), (11.25, 2.5), (4.0, 4.0)])
-def test_time_travel_composes_two_stamps_in_the_fixed_frame(helix: TransformTree, then: float, now: float) -> None:
-    found = helix.lookup("tip", "tip", int(now * SECOND), source_at=int(then * SECOND), fixed="world")
-    assert (found.parent, found.child, found.stamp, found.static) == ("tip", "tip", int(now * SECOND), False)
-    assert_close(found, tip_in_world(now).inverse() @ tip_in_world(then))
-
-
-def test_another_fixed_frame_gives_another_answer(helix: TransformTree) -> None:
-    then, now = 2.5, 10.0
-    question = partial(helix.lookup, "hub", "tip", int(now * SECOND), source_at=int(then * SECOND))
-    # Seen from the carriage the hub only turns; seen from itself nothing has moved.
-    turn = Transform.from_axis_angle((0, 0, 1), -0.3 * (now - then))
-    assert_close(question(fixed="carriage"), turn @ Transform((2.0, 0.0, 0.0)))
-    assert_close(question(fixed="hub"), Transform((2.0, 0.0, 0.0)))
-    climbed = Transform((0.0, 0.0, -0.5 * (now - then)))
-    assert_close(question(fixed="world"), turn @ Transform((2.0, 0.0, 0.0)) @ climbed)
-
 
 # Stamps and names
 

@@ -226,17 +226,6 @@ def test_source_at_is_one_stamp_for_each_answer_or_one_for_all(asked: Asked) -> 
     assert xs(found)[:3] == pytest.approx([-4.0, 2.0, -6.0])
 
 
-@few_and_many
-def test_time_travel_leads_over_the_fixed_frame_though_a_path_without_it_is_known(asked: Asked) -> None:
-    tree = tree_of(*over("map", "a", [0, 10]), *over("a", "b", [0, 10]), *over("map", "f", [0, 4], speed=2.0))
-    # The fixed frame has had two parents, so that its path depends on the stamp.
-    tree.insert_many(over("a", "f", [8, 10], speed=2.0))
-    assert tree.lookup("map", "b", 3).transform.translation[0] == 6.0
-    found = tree.lookup_many("map", "b", asked([1, 9]), source_at=asked([9, 2]), fixed="f")
-    # At 1, f is 2 in map; at 9 it is 18 in a, and b is 9 in a; at 2, it is 4 in map, and b is 2 + 2 there.
-    assert xs(found)[:2] == pytest.approx([2.0 + (9.0 - 18.0), (9.0 + 18.0) + (4.0 - 4.0)])
-
-
 # Arguments
 
 
