@@ -270,6 +270,10 @@ def test_the_facts_can_be_left_out() -> None:
     assert plain(to_html(TWO_EDGES, 0, with_facts=False)) == ["map", "└── base", "    └── lidar"]
 
 
+def test_an_empty_tree_has_a_text() -> None:
+    assert plain(to_html([], 0)) == ["(no frames)"]
+
+
 def test_frames_have_the_colour_of_their_state() -> None:
     root, base, lidar = to_html(TWO_EDGES, 9 * SECOND).split("\n")
     assert f'color: {EdgeState.STALE.value}">base<' in base
