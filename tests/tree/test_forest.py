@@ -320,3 +320,14 @@ def test_paths_that_are_asked_for_are_kept_and_others_are_forgotten_in_time() ->
     assert cache.find("a", "49999") is kept
     assert [cache.holds("a", name) for name in ("0", "41000", "49999", "wanted")] == [False, True, True, True]
     assert not cache.holds("b", "wanted")
+
+
+class Name(str):
+    __slots__ = ()
+
+
+def test_names_that_are_no_plain_strings_are_not_kept() -> None:
+    cache = PathCache(Lock())
+    cache.keep(Name("a"), "b", path_of_one_edge())
+    cache.keep("a", Name("b"), path_of_one_edge())
+    assert len(cache) == 0
