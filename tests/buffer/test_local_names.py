@@ -61,6 +61,7 @@ def two_robots(start: int = 0) -> tuple[SimulatedClock, Bus, list[TransformBroad
         pytest.param("robot1/", {"/map"}, ValueError, id="shared name with a slash"),
         pytest.param("robot1/", {5}, TypeError, id="shared number"),
         pytest.param("robot1/", {"robot1/map"}, ValueError, id="shared name with the prefix"),
+        pytest.param(None, {"map"}, TypeError, id="shared name without a prefix"),
     ],
 )
 @pytest.mark.parametrize("make", [partial(TransformBroadcaster), partial(Buffer)], ids=["broadcaster", "buffer"])
@@ -289,11 +290,3 @@ def test_a_frame_without_a_local_name_gets_a_leading_slash(text: str, shared: se
     prefix = Prefix(text, shared)
     local = prefix.local(name)
     assert local == f"/{name}" if local.startswith("/") else prefix.on_bus(local) == name
-
-
-@pytest.mark.parametrize("make", [partial(TransformBroadcaster), partial(Buffer)], ids=["broadcaster", "buffer"])
-def test_shared_frames_without_a_prefix_are_a_type_error(make: Callable[..., object]) -> None:
-    bus = Bus(SimulatedClock())
-    with pytest.raises(TypeError, match="prefix"):
-        make(bus, shared={"map"})
-    assert bus.statistics().buffers == ()

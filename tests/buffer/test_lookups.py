@@ -2,32 +2,41 @@
 
 import gc
 import random
+from contextlib import suppress
 from functools import partial
+from itertools import permutations, product
 from typing import Any
 
 import anyio
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
-from hypothesis import given
+from anyio.abc import TaskGroup
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.asking import Asked, driving, settle
-from support.samples import moving
+from support.samples import any_samples, moving
 
 from tfbus import (
+    LATEST,
     SECOND,
     Buffer,
     Bus,
+    Clock,
     FutureExtrapolationError,
-    GapError,
     Hold,
+    Latest,
     LookupTimeoutError,
     SimulatedClock,
+    SystemClock,
+    TransformLookupError,
     TransformStamped,
+    UnknownFrameError,
     from_seconds,
     to_seconds,
 )
 from tfbus.buffer.lookups import AlarmHeap, LoopAlarms
+from tfbus.errors import MAY_COME
 
 
 class HandLoop:
@@ -165,6 +174,71 @@ def test_alarms_on_one_loop_ring_although_another_one_ran_meanwhile() -> None:
     assert rung == ["first"]
 
 
+NANO = 1e-9
+Asking = tuple[str, str, int | Latest, dict[str, Any]]
+POLICIES: list[dict[str, Any]] = [
+    {},
+    {"tolerance": 3 * NANO},
+    {"max_gap": 4 * NANO},
+    {"extrapolate": Hold(4 * NANO)},
+    {"tolerance": 2 * NANO, "max_gap": 4 * NANO},
+]
+QUESTIONS: list[Asking] = [
+    *((*ends, at, policy) for ends in permutations("abcd", 2) for at in (LATEST, 5, 15) for policy in POLICIES),
+    *(
+        (target, source, at, {"source_at": 10, "fixed": fixed})
+        for target, source, fixed in product("abc", repeat=3)
+        for at in (LATEST, 5)
+    ),
+]
+
+CHAIN = [moving(parent, child, 1) for parent, child in ("ab", "bc", "cd")]
+some_samples = any_samples("abcd", 20) | st.builds(
+    lambda sample, stamp: sample.replace(stamp=stamp), st.sampled_from(CHAIN), st.integers(0, 20)
+)
+
+
+@settings(max_examples=30)
+@given(
+    st.integers(0, 5),
+    st.lists(st.lists(some_samples, min_size=1, max_size=3) | st.sampled_from("bcd"), min_size=5, max_size=15),
+    st.sampled_from([None, 8 * NANO]),
+    st.sampled_from([SystemClock, SimulatedClock]),
+)
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_a_lookup_waits_until_lookup_nowait_has_an_answer_or_an_error_that_waiting_cannot_help(
+    sixth: int, happenings: list[list[TransformStamped] | str], keep: float | None, clock: type[Clock]
+) -> None:
+    with Bus(clock()) as bus, Buffer(bus, keep) as buffer:
+        async with anyio.create_task_group() as tasks:
+            waiting = [(asking, ask(tasks, buffer, asking)) for asking in QUESTIONS[sixth::6]]
+            for happening in (CHAIN, *happenings):
+                if isinstance(happening, list):
+                    bus.publish(happening, invalid="drop")
+                else:
+                    with suppress(UnknownFrameError):
+                        bus.remove_frame(happening)
+                await settle()
+                for (target, source, at, question), asked in waiting:
+                    try:
+                        expected = buffer.lookup_nowait(target, source, at, **question)
+                    except MAY_COME:
+                        assert not asked.ended
+                    except TransformLookupError as error:
+                        assert (type(asked.error), str(asked.error)) == (type(error), str(error))
+                    else:
+                        assert asked.answer == expected
+                waiting = [(asking, asked) for asking, asked in waiting if not asked.ended]
+                assert len(buffer.pending()) == len(waiting)
+            tasks.cancel_scope.cancel()
+        assert buffer.pending() == ()
+
+
+def ask(tasks: TaskGroup, buffer: Buffer, asking: Asking) -> Asked[TransformStamped]:
+    target, source, at, question = asking
+    return Asked(tasks, partial(buffer.lookup, target, source, at, **question))
+
+
 @pytest.mark.parametrize("anyio_backend", ["asyncio"])
 async def test_a_thousand_lookups_that_hang_look_for_the_similar_names_of_three(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
@@ -201,67 +275,6 @@ async def test_a_thousand_lookups_that_hang_look_for_the_similar_names_of_three(
 
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
-
-
-@pytest.mark.parametrize(
-    ("policy", "too_early", "enough", "x", "extrapolated_by"),
-    [
-        ({"tolerance": 0.2}, 9.7, 9.8, 9.8, 0.2),
-        ({"extrapolate": Hold(0.5)}, 9.4, 9.6, 9.6, 0.4),
-        ({"tolerance": 0.2, "extrapolate": Hold(0.5)}, 9.4, 9.5, 9.5, 0.5),
-        ({"max_gap": 1.0}, 9.9, 10.5, 10.0, 0.0),
-    ],
-)
-async def test_a_lookup_under_a_policy_wakes_at_the_first_sample_that_allows_an_answer(
-    policy: dict[str, Any], too_early: float, enough: float, x: float, extrapolated_by: float
-) -> None:
-    with Bus() as bus, Buffer(bus) as buffer:
-        bus.publish(driving("map", "base", 9.0))
-        async with anyio.create_task_group() as tasks:
-            asked: Asked[TransformStamped] = Asked(
-                tasks, partial(buffer.lookup, "map", "base", from_seconds(10.0), **policy)
-            )
-            await settle()
-            bus.publish(driving("map", "base", too_early))
-            await settle()
-            assert not asked.ended
-            bus.publish(driving("map", "base", enough))
-            await settle()
-    assert asked.answer.transform.translation[0] == pytest.approx(x)
-    assert asked.answer.stamp == from_seconds(10.0)
-    assert asked.answer.extrapolated_by == from_seconds(extrapolated_by)
-
-
-async def test_a_gap_around_the_stamp_ends_the_wait_with_a_gap_error() -> None:
-    with Bus() as bus, Buffer(bus) as buffer:
-        bus.publish(driving("map", "base", 9.0))
-        async with anyio.create_task_group() as tasks:
-            asked: Asked[TransformStamped] = Asked(
-                tasks, partial(buffer.lookup, "map", "base", from_seconds(10.0), max_gap=1.0)
-            )
-            await settle()
-            bus.publish(driving("map", "base", 11.0))
-            await settle()
-        assert isinstance(asked.error, GapError)
-        assert not buffer.pending()
-
-
-@pytest.mark.parametrize("end", ["the lagging edge comes out of the gap", "a late sample fills the gap"])
-async def test_latest_in_the_gap_of_another_edge_waits_for_either_end_of_the_gap(end: str) -> None:
-    with Bus() as bus, Buffer(bus) as buffer:
-        # map -> base lags at 1.5 s, where base -> arm has a gap from 1 s to 2 s.
-        bus.publish([driving("map", "base", 1.5), driving("base", "arm", 1.0), driving("base", "arm", 2.0)])
-        async with anyio.create_task_group() as tasks:
-            asked: Asked[TransformStamped] = Asked(tasks, partial(buffer.lookup, "map", "arm", max_gap=0.6))
-            await settle()
-            assert not asked.ended
-            if end == "the lagging edge comes out of the gap":
-                bus.publish(driving("map", "base", 2.0))
-            else:
-                bus.publish(driving("base", "arm", 1.4))
-            await settle()
-            assert asked.ended
-    assert asked.answer.transform.translation[0] == pytest.approx(4.0 if asked.answer.stamp == 2 * SECOND else 3.0)
 
 
 async def test_under_a_hold_a_recent_sample_of_one_edge_satisfies_max_age() -> None:

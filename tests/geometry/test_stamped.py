@@ -37,31 +37,23 @@ def test_a_sample_gives_back_what_it_was_made_of() -> None:
     assert (sample.authority, sample.static) == ("odometry", True)
 
 
-@pytest.mark.parametrize("end", ["parent", "child"])
-def test_a_bad_frame_name_is_refused_with_the_facts_of_the_sample(end: str) -> None:
-    names = {"parent": "map", "child": "base_link", end: "/lidar"}
-    with pytest.raises(InvalidTransformError, match="write 'lidar'") as caught:
-        TransformStamped(names["parent"], names["child"], 0, MOVE, "odometry")
+@pytest.mark.parametrize(
+    ("parent", "child", "stamp", "reason", "text"),
+    [
+        ("/lidar", "base_link", 0, "frame name", "write 'lidar'"),
+        ("map", "/lidar", 0, "frame name", "write 'lidar'"),
+        ("map", "map", 0, "self transform", "frame 'map' cannot be its own parent"),
+        ("map", "base_link", STAMP_MIN - 1, "stamp", "64-bit"),
+        ("map", "base_link", STAMP_MAX + 1, "stamp", "64-bit"),
+    ],
+)
+def test_an_invalid_sample_is_refused_with_its_facts(
+    parent: str, child: str, stamp: int, reason: str, text: str
+) -> None:
+    with pytest.raises(InvalidTransformError, match=text) as caught:
+        TransformStamped(parent, child, stamp, MOVE, "odometry")
     error = caught.value
-    assert error.reason == "frame name"
-    assert (error.parent, error.child, error.authority) == (names["parent"], names["child"], "odometry")
-
-
-def test_a_frame_cannot_be_its_own_parent() -> None:
-    with pytest.raises(InvalidTransformError, match="frame 'map' cannot be its own parent") as caught:
-        TransformStamped("map", "map", 0, MOVE, "odometry")
-    error = caught.value
-    assert (error.reason, error.parent, error.child) == ("self transform", "map", "map")
-    assert error.authority == "odometry"
-
-
-@pytest.mark.parametrize("stamp", [STAMP_MIN - 1, STAMP_MAX + 1])
-def test_a_stamp_beyond_64_bits_is_refused(stamp: int) -> None:
-    with pytest.raises(InvalidTransformError, match="64-bit") as caught:
-        TransformStamped("map", "base_link", stamp, MOVE, "odometry")
-    error = caught.value
-    assert (error.reason, error.parent, error.child) == ("stamp", "map", "base_link")
-    assert error.authority == "odometry"
+    assert (error.reason, error.parent, error.child, error.authority) == (reason, parent, child, "odometry")
 
 
 @pytest.mark.parametrize("stamp", [STAMP_MIN, 0, STAMP_MAX, np.int64(5)])
@@ -232,13 +224,13 @@ def test_finite_numbers_whose_length_overflows_are_not_physical() -> None:
     assert not_physical(sample, GREATEST_BOUND).reason == "not physical"
 
 
-@pytest.mark.parametrize("bound", [0.0, -1.0, 1.1e100, math.inf, math.nan])
-def test_a_bound_is_greater_than_zero_and_at_most_1e100(bound: float) -> None:
-    with pytest.raises(ValueError, match="max_translation must be greater than 0 and at most 1e\\+100 m"):
-        as_max_translation(bound)
-
-
-@pytest.mark.parametrize("bound", [None, "far", True])
-def test_a_bound_is_a_number(bound: Any) -> None:
-    with pytest.raises(TypeError, match="max_translation must be a number in m"):
+@pytest.mark.parametrize(
+    ("bound", "error", "text"),
+    [
+        *((bound, ValueError, "greater than 0 and at most 1e\\+100 m") for bound in (0.0, -1.0, 1.1e100, math.nan)),
+        *((bound, TypeError, "a number in m") for bound in (None, "far", True)),
+    ],
+)
+def test_a_bound_of_translations_is_a_number_up_to_1e100(bound: Any, error: type[Exception], text: str) -> None:
+    with pytest.raises(error, match=f"max_translation must be {text}"):
         as_max_translation(bound)

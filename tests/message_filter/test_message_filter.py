@@ -117,7 +117,7 @@ def put(streams: Streams, *messages: Scan) -> None:
         streams.send.send_nowait(message)
 
 
-# What tf2 tests of its own filter
+# The tests of tf2's own filter
 
 
 async def test_a_message_in_the_target_frame_is_delivered_without_transforms(buffer: Buffer, streams: Streams) -> None:
@@ -282,9 +282,6 @@ async def test_messages_are_delivered_in_the_given_order(
         await settle()
         assert stamps(got) == expected
         tasks.cancel_scope.cancel()
-
-
-# Bounds
 
 
 # Time
@@ -533,42 +530,27 @@ async def test_an_error_of_the_body_is_raised_instead_of_one_of_the_source(buffe
 
 
 @pytest.mark.parametrize(
-    ("message", "error"),
+    ("message", "options", "error"),
     [
-        (Scan(1.5), TypeError),
-        (Scan(None), TypeError),
-        (Scan(2**63), ValueError),
-        (Scan(5, None), TypeError),  # type: ignore[arg-type]
-        ("no header", AttributeError),
+        (Scan(1.5), {}, TypeError),
+        (Scan(None), {}, TypeError),
+        (Scan(2**63), {}, ValueError),
+        (Scan(5, None), {}, TypeError),  # type: ignore[arg-type]
+        ("no header", {}, AttributeError),
+        (Scan(LATEST), {"order": "stamp"}, TypeError),
+        (Scan(0), {"stamp": lambda message: 1 // message.stamp}, ZeroDivisionError),
     ],
 )
 async def test_a_message_without_frame_and_stamp_is_an_error(
-    message: Any, error: type[Exception], buffer: Buffer
+    message: Any, options: dict[str, Any], error: type[Exception], buffer: Buffer
 ) -> None:
     async def one() -> AsyncIterator[Any]:
         yield message
 
     with pytest.raises(error):
-        async with MessageFilter(one(), buffer, "map") as pairs:
+        async with MessageFilter(one(), buffer, "map", **options) as pairs:
             await anext(pairs)
     assert (pairs.arrived, balanced(pairs)) == (0, True)
-
-
-async def test_a_message_stamped_latest_has_no_order_by_stamp(buffer: Buffer) -> None:
-    async def one() -> AsyncIterator[Scan]:
-        yield Scan(LATEST)
-
-    with pytest.raises(TypeError, match="stamp"):
-        async with MessageFilter(one(), buffer, "map", order="stamp") as pairs:
-            await anext(pairs)
-    assert pairs.arrived == 0
-
-
-async def test_an_error_of_a_frame_or_stamp_callable_is_raised_as_it_is(buffer: Buffer, streams: Streams) -> None:
-    put(streams, Scan(0))
-    with pytest.raises(ZeroDivisionError):
-        async with MessageFilter(streams.receive, buffer, "map", stamp=lambda message: 1 // message.stamp) as pairs:
-            await anext(pairs)
 
 
 async def test_an_error_of_closing_the_generator_is_raised(buffer: Buffer) -> None:
@@ -716,12 +698,6 @@ async def no_callback(_message: Scan, _reason: DropReason, _error: TransformErro
 def test_a_wrong_argument_is_an_error(arguments: dict[str, Any], error: type[Exception], buffer: Buffer) -> None:
     with pytest.raises(error):
         MessageFilter(**{"messages": Source(OSError()), "buffer": buffer, "target": "map", **arguments})
-
-
-def test_a_positional_queue_size_as_in_tf2_is_an_error(buffer: Buffer) -> None:
-    make: Any = MessageFilter
-    with pytest.raises(TypeError, match="positional"):
-        make(Source(OSError()), buffer, "map", 10)
 
 
 async def test_the_error_of_a_leading_slash_names_the_similar_frame(bus: Bus, buffer: Buffer, streams: Streams) -> None:

@@ -60,7 +60,7 @@ MET = {
     *(error.__name__ for error in USUAL_ERRORS),
     *("cycle", "reserved", "not a sample"),
 }
-"""What the soaks meet between them; without it there would be nothing to see."""
+"""The events that all soaks together meet; without them there would be nothing to see."""
 
 
 class Soak:

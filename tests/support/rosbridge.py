@@ -202,7 +202,7 @@ class Joined(NamedTuple):
         return [row for each in said for row in each["msg"]["transforms"]]
 
     def times(self, operation: str, topic: str) -> list[float]:
-        """When the server got some requests."""
+        """The times at which the server got some requests."""
         return [each["at"] for each in self.server.requests if (each["op"], each["topic"]) == (operation, topic)]
 
 

@@ -10,21 +10,18 @@ from typing import Any
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from support.samples import any_samples, moving, over, static, tree_of
+from support.samples import any_samples, moving, static, tree_of
 
 from tfbus import (
     LATEST,
     SECOND,
     Buffer,
     Bus,
-    ExplainedEdge,
     Explanation,
     FutureExtrapolationError,
-    GapError,
     Hold,
     InvalidTransformError,
     Latest,
-    PastExtrapolationError,
     SimulatedClock,
     TransformLookupError,
     TransformStamped,
@@ -62,15 +59,6 @@ def robot() -> TransformTree:
 # One edge
 
 
-def test_an_edge_has_the_samples_around_the_stamp_and_the_fraction_between_them() -> None:
-    tree = tree_of(*over("map", "a", (100, 200, 300)))
-    assert tree.explain("map", "a", 250).edges == (
-        ExplainedEdge("map", "a", False, 200, 300, 0.5, 0, 300, 0.0, 2 / (200 / SECOND)),
-    )
-    assert tree.explain("map", "a", 200).edges[0].before == tree.explain("map", "a", 200).edges[0].after == 200
-    assert tree.explain("map", "a", 200).edges[0].fraction == 0.0
-
-
 def test_between_samples_of_two_parents_the_fraction_is_zero() -> None:
     tree = tree_of(moving("map", "a", 100), moving("odom", "a", 200), static("map", "odom"))
     (edge,) = tree.explain("map", "a", 175).edges
@@ -90,33 +78,6 @@ def test_ages_are_counted_from_the_newest_stamp_in_the_tree_or_from_a_given_one(
 
 
 # The whole path
-
-
-def test_every_edge_that_does_not_cover_the_stamp_has_its_error() -> None:
-    tree = tree_of(*over("map", "a", (10, 20)), *over("a", "b", (30, 40)), *over("b", "c", (10, 40)))
-    found = tree.explain("map", "c", 25)
-    assert [type(edge.error) for edge in found.edges] == [
-        FutureExtrapolationError,
-        PastExtrapolationError,
-        type(None),
-    ]
-    assert found.errors == (found.edges[0].error, found.edges[1].error)
-    assert (found.answerable, found.stamp) == (False, None)
-
-
-def test_for_latest_every_edge_that_lags_behind_the_oldest_common_stamp_has_an_error() -> None:
-    tree = tree_of(*over("map", "a", (1, 10)), *over("a", "b", (1, 20)), *over("b", "c", (30, 40)))
-    found = tree.explain("map", "c")
-    lagging = [("a", 30, 1, 10), ("b", 30, 1, 20)]
-    for error, facts_of_edge in zip(found.errors, lagging, strict=True):
-        assert isinstance(error, FutureExtrapolationError)
-        assert (error.child, error.stamp, error.oldest, error.newest) == facts_of_edge
-    assert isinstance(found.errors[0].__cause__, PastExtrapolationError)
-    assert [(edge.before, edge.after) for edge in found.edges] == [(10, 10), (1, 20), (None, 30)]
-    # Within the tolerance, a sample may stand in.
-    for tolerance, blocking in ((9, ["a", "b"]), (10, ["a"]), (19, ["a"])):
-        errors = tree.explain("map", "c", tolerance=tolerance * NANO).errors
-        assert [error.child for error in errors if isinstance(error, FutureExtrapolationError)] == blocking
 
 
 def test_for_an_answer_that_is_too_old_every_edge_that_is_too_old_has_an_error() -> None:
@@ -149,21 +110,6 @@ def test_a_loop_in_the_past_is_shown_once() -> None:
     assert found.half_chains == (("x", "other"), ("a", "b", "a"))
     assert [(edge.parent, edge.child) for edge in found.edges] == [("other", "x"), ("b", "a"), ("a", "b")]
     assert "up from 'a' to 'a'" in str(found)
-
-
-def test_under_a_policy_each_edge_has_its_extrapolation_or_error() -> None:
-    tree = tree_of(*over("map", "a", (100, 200)), *over("a", "b", (100, 180)), *over("b", "c", (100, 300)))
-    question: dict[str, Any] = {"extrapolate": Hold(40 * NANO), "max_gap": 100 * NANO}
-    found = tree.explain("map", "c", 220, **question)
-    assert [(edge.fraction, edge.extrapolated_by, edge.error is None) for edge in found.edges] == [
-        (0.0, 20, True),
-        (0.0, 40, True),
-        (None, 0, False),
-    ]
-    assert isinstance(found.errors[0], GapError)
-    assert tree.explain("map", "a", 220, **question).stamp == 220
-    (edge,) = tree.explain("map", "a", 90, tolerance=10 * NANO).edges
-    assert (edge.fraction, edge.extrapolated_by) == (1.0, 10)
 
 
 @pytest.mark.parametrize("at", [1.5, None, True])

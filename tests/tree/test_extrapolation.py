@@ -294,27 +294,27 @@ def test_each_argument_may_be_given_alone_and_be_infinite(arguments: Any, policy
     assert policy_of(*arguments) == policy
 
 
-@pytest.mark.parametrize("bad", [-1.0, math.nan])
-def test_a_negative_duration_is_an_error_that_names_the_argument(bad: float) -> None:
-    with pytest.raises(ValueError, match="tolerance"):
-        policy_of(bad, None, None)
-    with pytest.raises(ValueError, match="max_gap"):
-        policy_of(0.0, bad, None)
-    with pytest.raises(ValueError, match="max_age"):
+@pytest.mark.parametrize(
+    ("policy", "error", "text"),
+    [
+        ({"tolerance": -1.0}, ValueError, "tolerance"),
+        ({"max_gap": math.nan}, ValueError, "max_gap"),
+        ({"tolerance": "1"}, TypeError, "tolerance"),
+        ({"tolerance": True}, TypeError, "tolerance"),
+        ({"extrapolate": 0.2}, TypeError, r"extrapolate must be a Hold, not 0\.2"),
+    ],
+)
+def test_a_wrong_policy_is_an_error_that_names_the_argument(
+    tree: TransformTree, policy: dict[str, Any], error: type[Exception], text: str
+) -> None:
+    with pytest.raises(error, match=text):
+        tree.lookup("odom", "tool", 0, **policy)
+
+
+@pytest.mark.parametrize(("bad", "error"), [(-1.0, ValueError), (math.nan, ValueError), ("1", TypeError)])
+def test_a_hold_has_a_duration(bad: Any, error: type[Exception]) -> None:
+    with pytest.raises(error, match="max_age"):
         Hold(bad)
-
-
-@pytest.mark.parametrize("bad", ["1", None, True])
-def test_an_argument_that_is_no_number_of_seconds_is_a_type_error(bad: Any) -> None:
-    with pytest.raises(TypeError, match="tolerance"):
-        policy_of(bad, None, None)
-    with pytest.raises(TypeError, match="max_age"):
-        Hold(bad)
-
-
-def test_an_age_alone_is_no_extrapolation() -> None:
-    with pytest.raises(TypeError, match=r"extrapolate must be a Hold, not 0\.2"):
-        policy_of(0.0, None, 0.2)  # type: ignore[arg-type]
 
 
 def test_a_hold_is_a_value() -> None:

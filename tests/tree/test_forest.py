@@ -21,7 +21,6 @@ from tfbus import (
     TransformTree,
 )
 from tfbus.rows import IDENTITY
-from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tree.forest import Forest, Path, PathCache, find_path, path_at
 from tfbus.tree.history import FrameHistory, save_frame
 from tfbus.tree.tree import forest_of
@@ -84,32 +83,6 @@ def ancestors(parent_of: dict[str, str], frame: str) -> set[str]:
     while (frame := parent_of.get(frame, frame)) not in seen:
         seen.add(frame)
     return seen
-
-
-# The edge that decides
-
-
-def path_over(*windows: tuple[int, int] | None) -> Path:
-    """A path up over one moving edge for each window, the lowest first; None is an edge without samples."""
-    frames: Frames = {}
-    for level, window in enumerate(windows):
-        samples = [] if window is None else [(window[0], Transform()), (window[1], Transform())]
-        frames[str(level)] = moving_edge(str(level + 1), str(level), samples)
-    return find_path(frames, str(len(windows)), "0", None)
-
-
-def test_of_several_future_extrapolations_that_of_the_most_lagging_edge_decides() -> None:
-    error = path_over((0, 12), (0, 10), (0, 20)).deciding_error(15)
-    assert type(error) is FutureExtrapolationError
-    assert (error.child, error.newest) == ("1", 10)
-    assert path_over((0, 12), None, (0, 10)).deciding_error(15).child == "1"
-    # A stamp that some edges have reached is the oldest that the others lack.
-    last = STAMP_MAX
-    assert path_over((0, last), (0, last - 1)).deciding_error(last).child == "1"
-    assert path_over((0, last - 1), (0, last)).deciding_error(last).child == "0"
-    # Of two that lag as far, the first one.
-    assert path_over((0, 20), (0, 10), (0, 10)).deciding_error(15).child == "1"
-    assert path_over((0, 20), None, (STAMP_MIN, STAMP_MIN)).deciding_error(15).child == "1"
 
 
 # The path that counts at a stamp
@@ -210,42 +183,6 @@ def test_a_bounded_number_of_changing_newest_paths_is_kept() -> None:
     assert len(known.changing_paths) == 1_320, "5,000 are kept, and then none"
 
 
-# Recorded changes, from which a live tree finds the lookups to wake
-
-
-def test_no_change_is_recorded_any_longer_once_it_is_forgotten_or_was_inserted_without_a_bus() -> None:
-    known = forest(moving("a", "b", 0), window=5)
-
-    def changes() -> list[int]:
-        return [len(each) for each in (known.changed, known.new_parents, known.looping, known.expired_samples)]
-
-    batch = (moving("a", "b", 8), moving("z", "b", 9), moving("a", "b", 1), moving("b", "z", 9), moving("b", "z", 8))
-    known.commit(batch)
-    assert min(changes()) > 0
-    known.forget_changes()
-    assert changes() == [0, 0, 0, 0]
-    known.insert((moving("y", "b", 10), moving("y", "b", 1)))
-    assert changes() == [0, 0, 0, 0]
-
-
-def test_the_version_is_another_one_after_each_change() -> None:
-    known = forest(moving("a", "b", 0), moving("a", "c", 0))
-    versions = [known.version]
-    for change in (
-        lambda: known.commit((moving("a", "b", 1),)),
-        lambda: known.insert((moving("a", "b", 2),)),
-        lambda: known.insert((moving("a", "b", 0),)),
-        known.clear,
-        lambda: known.commit((moving("z", "b", 3),)),
-        lambda: known.remove("c"),
-        lambda: known.append("b", np.array([4]), np.full((1, 7), 0.5)),
-        known.clear,
-    ):
-        change()
-        versions.append(known.version)
-    assert len(set(versions)) == 9
-
-
 # All frames at one moment
 
 
@@ -289,18 +226,6 @@ def test_an_error_of_a_reader_ends_the_reading() -> None:
     assert known.readers == {}, "nobody is to be told of changes any longer"
     assert known.read_all(len) == {"a": 1}
     assert known.readers == {}
-
-
-# Loops of parents in the past
-
-
-def looping(*batch: TransformStamped) -> list[tuple[str, int, tuple[str, ...]]]:
-    known = forest()
-    for sample in batch:
-        known.insert_judged(sample)
-        known.find_past_loops()
-    assert known.looped == len(known.looping)
-    return [(found.sample.child, found.loop.stamp, found.loop.frames) for found in known.looping]
 
 
 # Searches without the lock

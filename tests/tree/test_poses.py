@@ -138,17 +138,6 @@ def test_a_sample_that_has_left_the_window_is_not_heard() -> None:
     assert read(tree, "map", SECOND).heard.tolist() == [STAMP_MIN, STAMP_MIN]
 
 
-def test_a_reader_follows_frames_that_are_added_reparented_and_removed() -> None:
-    tree = tree_of(static("map", "a", 1.0), static("a", "b", 1.0))
-    reader = PoseReader(forest_of(tree))
-    assert x_in(reader.read("map"), "b") == 2.0
-    tree.insert(static("map", "b", 5.0))
-    tree.insert(static("b", "c", 1.0))
-    assert x_in(reader.read("map"), "c") == 6.0
-    tree.remove_frame("a")
-    assert set(reader.read("map").frames) == {"map", "b", "c"}
-
-
 CHANGES = st.one_of(any_samples("abcd", last=10), st.sampled_from("abcd"), st.none())
 
 

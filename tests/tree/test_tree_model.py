@@ -100,7 +100,7 @@ class Child:
         return interpolated(before.transform, after.transform, (at - before.stamp) / (after.stamp - before.stamp))
 
     def facts(self, name: str, at: At) -> Facts:
-        """Those of the error that says that `at` is not covered."""
+        """The facts of the error that says that `at` is not covered."""
         moving = self.moving
         if not moving:
             return FutureExtrapolationError, name, at, None, None, self.authority
@@ -128,7 +128,7 @@ class Model:
         self.keep = keep
         self.children: dict[str, Child] = {}
 
-    # What is stored
+    # Storing
 
     def insert(self, batch: list[TransformStamped]) -> list[Outcome]:
         """Store all of a batch, or raise `Refused`."""
@@ -198,7 +198,7 @@ class Model:
             for name, child in sorted(self.children.items())
         ]
 
-    # What is asked
+    # Answering
 
     def check_known(self, *names: str) -> None:
         for name in names:
@@ -225,7 +225,7 @@ class Model:
         if short:
             errors = [self.children[name].facts(name, at) for name in short]
             past = [facts for facts in errors if facts[0] is PastExtrapolationError]
-            # Among those that may still come, the one that has come least far.
+            # If all missing samples may still come, the error names the edge that lags most.
             last = min(reach(facts) for facts in errors)
             raise Blocked(*(past or [facts for facts in errors if reach(facts) == last]))
         matrix: Matrix = np.eye(4)

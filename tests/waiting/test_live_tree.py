@@ -1,32 +1,23 @@
 """"""
 
 from functools import partial
-from itertools import product
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.samples import any_samples, live_tree, moving, static, tree_over
+from support.samples import live_tree, moving, static, tree_over
 
 from tfbus import (
     LATEST,
     Edge,
-    ExtrapolationError,
-    FutureExtrapolationError,
-    InvalidTransformError,
-    Latest,
-    PastExtrapolationError,
     Question,
     TransformLookupError,
-    TransformStamped,
-    TransformTree,
     UnknownFrameError,
 )
 from tfbus.errors import MAY_COME
 from tfbus.tree.forest import LoopingSample
 from tfbus.tree.history import FrameHistory
-from tfbus.tree.lookup import Policy, answer
 from tfbus.waiting.live_tree import LiveTree, Waiter
 
 
@@ -52,104 +43,6 @@ def test_a_sample_wakes_exactly_the_waiters_whose_stamp_it_covers() -> None:
     assert [pending.question.at for pending in live.waiting.pending()] == [5, 3]
 
 
-@pytest.mark.parametrize(
-    "sample",
-    [
-        pytest.param(moving("other", "a", 9), id="another parent"),
-        pytest.param(static("map", "a"), id="another kind"),
-        pytest.param(moving("map", "a", 0), id="a longer past"),
-    ],
-)
-def test_a_change_of_parent_kind_or_oldest_sample_wakes_the_waiters_below(sample: object) -> None:
-    live = live_tree(None)
-    woken: list[str] = []
-    live.insert((moving("map", "a", 1), moving("map", "b", 1)))
-    park(live, "map", "a", 9, woken)
-    park(live, "map", "b", 9, woken)
-    live.insert((sample,))  # type: ignore[arg-type]
-    assert woken == ["a"]
-
-
-def test_removing_a_frame_wakes_the_waiters_for_it_and_its_descendants() -> None:
-    live = live_tree(None)
-    woken: list[str] = []
-    live.insert((moving("map", "a", 1), moving("map", "b", 1), moving("b", "c", 1)))
-    for source in "abc":
-        park(live, "map", source, 9, woken)
-    live.remove_frame("unknown")
-    assert woken == []
-    live.remove_frame("b")
-    assert sorted(woken) == ["b", "c"]
-    assert tree_over(live).frames() == ["a", "b", "c", "map"]
-    live.remove_frame("a")
-    assert sorted(woken) == ["a", "b", "c"]
-    assert tree_over(live).frames() == ["b", "c"]
-
-
-STAMPS: tuple[int | Latest, ...] = (LATEST, 5, 15)
-QUESTIONS = [
-    *(Question(target, source, at) for target, source, at in product("abcd", "abcd", STAMPS)),
-    *(Question(target, source, at, 10, fixed) for target, source, fixed, at in product("abc", "abc", "abc", STAMPS)),
-]
-
-
-def ask(live: LiveTree, question: Question) -> None:
-    answer(
-        live.forest,
-        question.target,
-        question.source,
-        question.at,
-        question.source_at,
-        question.fixed,
-        None,
-        question.policy,
-    )
-
-
-@given(st.lists(st.lists(any_samples("abcd", 20), min_size=1, max_size=3), max_size=8), st.sampled_from([None, 8e-9]))
-def test_a_waiter_that_is_not_woken_still_has_no_answer(
-    batches: list[list[TransformStamped]], keep: float | None
-) -> None:
-    live, judge = live_tree(keep), TransformTree(keep)
-    asleep: set[Question] = set()
-    woken = list(QUESTIONS)
-    past: list[Question] = []
-    for batch in batches:
-        for question in woken:
-            try:
-                ask(live, question)
-            except PastExtrapolationError:
-                past.append(question)
-            except TransformLookupError as error:
-                live.park(Waiter(question, 0, partial(woken.append, question)), error)
-                asleep.add(question)
-        woken[:] = past
-        past.clear()
-        try:
-            judge.insert_many(batch)
-        except InvalidTransformError:
-            continue
-        live.insert(tuple(batch))
-        asleep.difference_update(woken)
-        for question in asleep:
-            # Nor is it hopeless.
-            with pytest.raises(MAY_COME):
-                ask(live, question)
-
-
-def test_late_samples_that_fill_the_common_stamp_wake_the_waiters_for_latest() -> None:
-    live = live_tree(None)
-    for sample in (moving("a", "d", 13), moving("d", "c", 16), moving("c", "b", 18), moving("a", "b", 16)):
-        live.insert((sample,))
-    with pytest.raises(TransformLookupError) as caught:
-        tree_over(live).lookup("b", "d")
-    woken: list[str] = []
-    live.waiting.park(Waiter(Question("b", "d", LATEST), 0, partial(woken.append, "d")), caught.value)
-    live.insert((moving("a", "d", 18),))
-    assert tree_over(live).can_transform("b", "d")
-    assert woken == ["d"]
-
-
 def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1), moving("map", "b", 1), static("map", "mount")))
@@ -164,102 +57,12 @@ def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
     assert len(live.waiting) == 100
 
 
-TWO_EDGES = [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)]
-
-
-@pytest.mark.parametrize(
-    ("before", "question", "harmless", "then"),
-    [
-        pytest.param(
-            TWO_EDGES,
-            Question("map", "b", 5),
-            moving("a", "b", 10),
-            moving("a", "b", 11),
-            id="another edge slides past the stamp",
-        ),
-        pytest.param(
-            [moving("map", "a", 0), moving("a", "b", 3)],
-            Question("map", "b", 5),
-            moving("a", "b", 13),
-            moving("a", "b", 16),
-            id="another edge that lags jumps over the stamp",
-        ),
-        pytest.param(
-            [*TWO_EDGES, moving("map", "other", 500)],
-            Question("map", "b", 5),
-            moving("map", "other", 600),
-            moving("a", "b", 11),
-            id="other frames are far ahead",
-        ),
-        pytest.param(
-            TWO_EDGES,
-            Question("map", "b", 30, 5, "a"),
-            moving("map", "a", 9),
-            moving("a", "b", 11),
-            id="the other half of time travel slides past its stamp",
-        ),
-        pytest.param(
-            TWO_EDGES,
-            Question("map", "b", 5, policy=Policy(tolerance=4)),
-            moving("a", "b", 15),
-            moving("a", "b", 20),
-            id="with a tolerance, the nearest sample counts",
-        ),
-        pytest.param(
-            [moving("map", "a", 0), moving("a", "b", 3)],
-            Question("map", "b", 5, policy=Policy(max_gap=4)),
-            moving("a", "b", 4),
-            moving("a", "b", 9),
-            id="a gap opens round the stamp",
-        ),
-    ],
-)
-def test_a_waiter_is_woken_by_the_insertion_that_makes_it_hopeless(
-    before: list[TransformStamped], question: Question, harmless: TransformStamped, then: TransformStamped
-) -> None:
-    live = live_tree(10e-9)
-    for sample in before:
-        live.insert((sample,))
-    woken: list[str] = []
-    with pytest.raises(MAY_COME) as caught:
-        ask(live, question)
-    live.park(Waiter(question, 0, partial(woken.append, "woken")), caught.value)
-    live.insert((harmless,))
-    if woken:
-        # Woken early, it asks again, and still may have an answer.
-        with pytest.raises(MAY_COME) as caught:
-            ask(live, question)
-        live.park(Waiter(question, 0, partial(woken.append, "woken")), caught.value)
-        woken.clear()
-    assert woken == []
-    live.insert((then,))
-    assert woken == ["woken"]
-    assert live.waiting.by_frame == {}
-    with pytest.raises(ExtrapolationError) as raised:
-        ask(live, question)
-    assert not isinstance(raised.value, FutureExtrapolationError)
-
-
 def test_an_expired_sample_of_a_frame_that_is_static_by_the_end_of_its_batch_is_not_ahead() -> None:
     live = live_tree(10e-9)
     live.tell_expired = lambda _sample, newest, _authority: newest > 0
     live.insert((moving("map", "a", 100), moving("map", "b", 100)))
     live.insert((moving("map", "a", 1), moving("map", "b", 1), static("map", "b")))
     assert (live.statistics(5).expired, live.expired_ahead) == (2, 1)
-
-
-def test_another_question_of_a_waiter_that_becomes_hopeless_wakes_it() -> None:
-    live = live_tree(10e-9)
-    live.insert((moving("map", "a", 0), moving("map", "b", 0), moving("map", "b", 9)))
-    woken: list[str] = []
-    with pytest.raises(FutureExtrapolationError) as caught:
-        tree_over(live).lookup("map", "a", 5)
-    others = (Question("map", "b", 5),)
-    live.park(Waiter(Question("map", "a", 5), 0, partial(woken.append, "a"), others), caught.value)
-    live.insert((moving("map", "b", 10),))
-    assert woken == []
-    live.insert((moving("map", "b", 11),))
-    assert woken == ["a"]
 
 
 class CountedFrames(dict[str, FrameHistory]):
@@ -431,7 +234,7 @@ def test_with_and_without_the_feed_the_same_lookups_are_woken_with_the_same_answ
 ) -> None:
     plays = [Play(keep, feeds) for feeds in (True, False)]
     for play in plays:
-        # Then most of what is drawn continues these edges.
+        # So most drawn samples continue these edges.
         play.insert([("map", child, 1, False) for child in FED_FRAMES])
     for name, *arguments in steps:
         for play in plays:

@@ -114,25 +114,6 @@ def test_the_names_are_those_of_all_questions_of_parked_waiters() -> None:
     assert set(index.names) == set()
 
 
-def test_waiting_since_leaves_out_those_that_came_later() -> None:
-    index = WaitingIndex()
-    for since in (10, 30, 20):
-        index.park(Waiter(Question("map", f"f{since}", LATEST), since, list), unknown("tool"))
-    assert [pending.since for pending in index.waiting_since(20)] == [10, 20]
-
-
-def test_pending_lists_each_question_with_its_error() -> None:
-    index = WaitingIndex()
-    question = Question("map", "camera", 5)
-    error = unknown("camera")
-    index.park(Waiter(question, since=12, wake=list), error)
-    [pending] = index.pending()
-    assert (pending.question, pending.since, pending.blocked_by) == (question, 12, error)
-    assert str(pending) == "'camera' in 'map': frame 'camera' is not known"
-    with pytest.raises(AttributeError):
-        pending.since = 0  # type: ignore[misc]
-
-
 def test_without_traceback_has_none_in_the_error_and_in_all_its_causes() -> None:
     def fail() -> None:
         try:

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import any_samples, live_tree, moving, tree_over
 
-from tfbus import ClockResetError, InvalidTransformError, TransformLookupError, TransformStamped, TransformTree
+from tfbus import InvalidTransformError, TransformLookupError, TransformStamped, TransformTree
 from tfbus.waiting.live_tree import LiveTree
 from tfbus.waiting.watch_index import WatchState
 
@@ -33,45 +33,6 @@ class Watcher:
         return answer
 
 
-def watched_frames(live: LiveTree) -> set[str]:
-    return set(live.watching.by_frame)
-
-
-def test_the_first_batch_on_the_path_wakes_and_later_ones_are_only_counted() -> None:
-    live = live_tree(None)
-    live.insert((moving("map", "a", 1), moving("a", "b", 1)))
-    watcher = Watcher(live, "map", "b")
-    watcher.read()
-    live.insert((moving("map", "other", 2),))
-    assert (watcher.woken, watcher.state.outdated, watcher.state.updates) == (0, False, 0)
-    live.insert((moving("map", "a", 2), moving("a", "b", 2), moving("a", "b", 3)))
-    live.insert((moving("map", "a", 3),))
-    assert (watcher.woken, watcher.state.outdated, watcher.state.updates) == (1, True, 2)
-
-
-def test_a_change_of_parent_off_the_path_does_not_make_a_watch_outdated() -> None:
-    live = live_tree(None)
-    live.insert((moving("world", "map", 1), moving("map", "a", 1), moving("map", "b", 1)))
-    watcher = Watcher(live, "map", "a")
-    watcher.read()
-    live.insert((moving("mars", "map", 2),))
-    live.insert((moving("a", "b", 2),))
-    live.insert((moving("map", "new", 2),))
-    assert (watcher.woken, watcher.state.outdated) == (0, False)
-
-
-def test_a_reset_makes_every_watch_outdated_and_keeps_it_registered() -> None:
-    live = live_tree(None)
-    live.insert((moving("map", "a", 5),))
-    answered, waiting = Watcher(live, "map", "a"), Watcher(live, "map", "unknown")
-    answered.read()
-    live.reset(5, 2)
-    for watcher in (answered, waiting):
-        assert (watcher.woken, watcher.state.outdated) == (1, True)
-        assert isinstance(watcher.state.reset, ClockResetError)
-    assert (len(live.watching), watched_frames(live)) == (2, set())
-
-
 def test_removing_a_watch_keeps_the_others_under_its_frames() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1),))
@@ -97,14 +58,6 @@ def test_an_error_of_one_watch_does_not_keep_others_from_being_woken() -> None:
         watcher.read()
     live.insert((moving("map", "a", 2),))
     assert second.woken == 1
-
-
-def test_a_waiting_watch_counts_as_a_waiter() -> None:
-    live = live_tree(None)
-    watcher = Watcher(live, "map", "a")
-    assert not live.has_waiters
-    watcher.state.waiting = True
-    assert live.has_waiters
 
 
 @given(st.lists(st.lists(any_samples("abcd", 20), min_size=1, max_size=3), max_size=8), st.sampled_from([None, 8e-9]))

@@ -32,6 +32,7 @@ def main() -> None:
     try:
         status = run(sys.argv[1:], begin)
     finally:
+        gc.enable()
         if heard:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
     sys.exit(status)

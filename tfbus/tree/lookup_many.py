@@ -189,7 +189,7 @@ def _changes(forest: Forest, target: str, source: str, path: Path | None, low: i
     edges = forest.edges_above(target, source)
     if not any(edge.mixed for edge in edges):
         return []
-    # Of two ways round a loop of parents, the one whose samples cover the stamp counts.
+    # A loop of parents has two ways round: the way whose samples cover the stamp counts.
     changes = {stamp for edge in edges for stamp in edge.beginnings()}
     changes.update(edge.newest + 1 for edge in edges if edge.newest is not None)
     return sorted(stamp for stamp in changes if low < stamp <= high)

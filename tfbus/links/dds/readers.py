@@ -1,4 +1,4 @@
-"""How a link hears a DDS domain: it joins so that nothing is lost, and a thread takes messages and names their nodes.
+"""A link hears a DDS domain: it joins so that nothing is lost, and a thread takes messages and names their nodes.
 
 As soon as a participant of Fast DDS hears of another one, it tells of its writers, and as soon as it hears of a reader,
 it sends what is latched. Cyclone DDS drops both while it does not know their sender, and Fast DDS repeats them only
