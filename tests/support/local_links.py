@@ -18,7 +18,7 @@ from tfbus.links.wire import Hearing, Joined, Left, WireItem
 from tfbus.tf_message import MalformedMessageError
 
 ALL = (Hearing("*", "all"),)
-PATIENCE = 50.0
+PATIENCE = 20.0
 
 
 class Ear:
@@ -123,11 +123,15 @@ class RawPeer:
         message, self._read = self._read[4 : 4 + length], self._read[4 + length :]
         return message
 
+    def hello(self, robot: str = "") -> bytes:
+        """A hello of this peer."""
+        start = b"tfbus local 1\n" + blake2b(self._domain.encode(), digest_size=16).digest()
+        return start + self.link.encode() + secrets.token_bytes(16) + robot.encode()
+
     async def meet(self, robot: str = "", channel: str = "all", *, link: str = "", key: bytes | None = None) -> str:
         """Say hello and welcome; returns the channel that the other link hears."""
         self.link = link or self.link
-        start = b"tfbus local 1\n" + blake2b(self._domain.encode(), digest_size=16).digest()
-        hello = start + self.link.encode() + secrets.token_bytes(16) + robot.encode()
+        hello = self.hello(robot)
         await self.say(hello)
         theirs, welcome = await self.hear(), await self.hear()
         both = struct.pack("<I", len(hello)) + hello + theirs
