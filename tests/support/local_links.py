@@ -1,4 +1,4 @@
-"""Links of one machine: wires of this process and of others, and a peer of the tests that speaks the protocol itself."""
+"""Links of one machine: wires of this process, and a peer of the tests that speaks their protocol itself."""
 
 import hmac
 import secrets
@@ -102,9 +102,9 @@ class RawPeer:
     @classmethod
     async def connect(cls, path: Path, domain: str, receive_buffer: int | None = None) -> Self:
         """Connect to the link whose file is given, by either of the two ways."""
-        if path.is_socket():
+        if await anyio.Path(path).is_socket():
             return cls(await anyio.connect_unix(path), domain)
-        port, key = path.read_text().split()
+        port, key = (await anyio.Path(path).read_text()).split()
         sock = socket.socket()
         if receive_buffer is not None:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)

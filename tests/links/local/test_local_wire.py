@@ -1,5 +1,6 @@
 """Links of one machine at the seam below them, over real sockets."""
 
+import gc
 import os
 import resource
 import shutil
@@ -22,7 +23,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.local_links import ALL, Ear, RawPeer, files_in, framed, running
-from support.processes import Program
+from support.processes import OPEN_FILES, Program
 
 from tfbus.links.local import LocalWire
 from tfbus.links.local.local_wire import MOST_STRANGERS, MOST_UNFINISHED, matches
@@ -70,7 +71,7 @@ async def test_two_links_meet_and_what_they_publish_and_send_arrives(directory: 
         assert ear_one.items == [(two.id, Joined("two")), (two.id, b"to one")]
         assert ear_two.items == [(one.id, Joined("one")), (one.id, b"to all")]
     assert (one.publish("all", b""), two.send(one.id, b"")) == (False, False)
-    assert list(Path(directory).iterdir()) == []
+    assert files_in(directory) == []
 
 
 async def test_a_link_hears_the_channel_of_the_first_pattern_that_fits_and_of_others_only_what_is_sent_to_it(
@@ -329,7 +330,7 @@ async def test_of_many_strangers_the_oldest_make_room(directory: str) -> None:
         for _ in range(MOST_STRANGERS + 1):
             strangers.append(await RawPeer.connect(files_in(directory)[0], DOMAIN))
             await stack.enter_async_context(strangers[-1].stream)
-            await anyio.sleep(0)
+            await anyio.lowlevel.checkpoint()
         assert await strangers[0].end() == []
         # The last one is among those that were kept.
         await strangers[-1].meet()
@@ -439,7 +440,7 @@ async def test_the_end_of_a_killed_process_is_seen_and_its_name_removed(director
             await ear.left(peer)
             # The younger link finds nobody there.
             with anyio.fail_after(20):
-                while len(files_in(directory)) == 2:
+                while len(files_in(directory)) == 2:  # noqa: ASYNC110 - nothing tells
                     await anyio.sleep(0.01)
 
 
@@ -495,7 +496,7 @@ async def test_a_file_at_which_nobody_listens_is_removed(directory: str, loopbac
         async with running(younger) as ear:
             await ear.joined(elder.id)
             with anyio.fail_after(20):
-                while path.with_name("0" * 24).exists():
+                while path.with_name("0" * 24).exists():  # noqa: ASYNC110 - nothing tells
                     await anyio.sleep(0.01)
 
 
@@ -537,11 +538,23 @@ async def test_a_link_without_free_files_goes_on_and_meets_others_when_there_are
 # Opening and closing
 
 
-@pytest.mark.parametrize("folder", ["", "sub"])
-async def test_a_directory_that_others_may_enter_is_refused_with_what_to_do(directory: str, folder: str) -> None:
+def folder_of(directory: str, folder: str, mode: int) -> Path:
     place = Path(directory, folder)
     place.mkdir(exist_ok=True)
-    place.chmod(0o755)
+    place.chmod(mode)
+    return place
+
+
+def file_and_link(directory: str) -> tuple[Path, Path]:
+    file, link = Path(directory, "file"), Path(directory, "link")
+    file.touch()
+    link.symlink_to(directory)
+    return file, link
+
+
+@pytest.mark.parametrize("folder", ["", "sub"])
+async def test_a_directory_that_others_may_enter_is_refused_with_what_to_do(directory: str, folder: str) -> None:
+    place = folder_of(directory, folder, 0o755)
     wire = LocalWire(DOMAIN, directory=str(place))
     with pytest.raises(PermissionError, match=rf"{place} has the mode 755, .*: run chmod 700 {place}, or set TFBUS"):
         async with running(wire):
@@ -557,10 +570,7 @@ async def test_a_directory_of_another_user_is_refused(directory: str) -> None:
 
 
 async def test_a_file_or_a_symbolic_link_in_place_of_the_directory_is_refused(directory: str) -> None:
-    file, link = Path(directory, "file"), Path(directory, "link")
-    file.touch()
-    link.symlink_to(directory)
-    for place in (file, link):
+    for place in file_and_link(directory):
         with pytest.raises(PermissionError, match="director"):
             async with running(LocalWire(DOMAIN, directory=str(place))):
                 pass
@@ -635,14 +645,16 @@ async def test_a_link_opened_and_closed_often_leaves_no_memory_no_files_and_no_t
 
     for _ in range(20):
         await once()
-    files, threads = len(os.listdir("/proc/self/fd")), threading.active_count()
+    files, threads = len(list(OPEN_FILES.iterdir())), threading.active_count()
     tracemalloc.start()
     try:
+        gc.collect()
         before = tracemalloc.get_traced_memory()[0]
         for _ in range(250):
             await once()
+        gc.collect()
         left = tracemalloc.get_traced_memory()[0] - before
     finally:
         tracemalloc.stop()
     assert left / 500 < 2_000
-    assert (len(os.listdir("/proc/self/fd")), threading.active_count()) == (files, threads)
+    assert (len(list(OPEN_FILES.iterdir())), threading.active_count()) == (files, threads)

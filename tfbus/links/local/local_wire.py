@@ -70,7 +70,7 @@ MOST_UNFINISHED: Final = 2**26
 """Bytes of all messages together that have begun to arrive."""
 PATIENCE: Final = 10.0
 """s until a connection has to be met."""
-READ_BUFFER: Final = 2**18
+READ_BUFFER: Final = 2**17
 _OFTEN, _RARELY = 0.01, 1.0
 _FIRST_RETRY, _LAST_RETRY = 0.05, 10.0
 _FLUSH_TIME = 1.0
@@ -164,10 +164,13 @@ class LocalWire(Wire):
         finally:
             for connection in self._connections:
                 connection.close()
-            self._poll.close()
-            self._connections.clear()
-            self._links.clear()
-            self._hearers.clear()
+            self._forget()
+
+    def _forget(self) -> None:
+        self._poll.close()
+        for held in (self._connections, self._links, self._hearers, self._strangers, self._unfinished, self._dialled):
+            held.clear()
+        self._buffer = memoryview(b"")
 
     # Listening and dialling
 
@@ -409,10 +412,7 @@ class LocalWire(Wire):
             self._listener = None
         for connection in self._connections:
             connection.abandon()
-        self._poll.close()
-        self._connections.clear()
-        self._links.clear()
-        self._hearers.clear()
+        self._forget()
 
 
 def channel_for(robot: str, hears: Sequence[Hearing]) -> str | None:
