@@ -73,6 +73,8 @@ PATIENCE: Final = 10.0
 READ_BUFFER: Final = 2**17
 _OFTEN, _RARELY = 0.01, 1.0
 _FIRST_RETRY, _LAST_RETRY = 0.05, 10.0
+_STEADY = 5.0
+"""s; a connection that has lasted for so long may be made again at once."""
 _FLUSH_TIME = 1.0
 
 
@@ -114,7 +116,7 @@ class LocalWire(Wire):
         self._unfinished: dict[Connection, int] = {}
         self._unfinished_size = 0
         self._dialled: dict[str, Connection] = {}
-        # The time of the next try (s), and the pause before it, by the names that were dialled in vain.
+        # The time before which a name is not dialled again (s), and the pause after that, by the names.
         self._retries: dict[str, tuple[float, float]] = {}
         self._warned: set[tuple[type[Exception], object]] = set()
 
@@ -290,11 +292,12 @@ class LocalWire(Wire):
             for connection, readable, writable in self._poll.ready():
                 if connection is None:
                     await self._accept(budget)
-                elif not connection.closed:
-                    if writable:
-                        connection.flush()
-                    if readable:
+                else:
+                    # The reading first: it tells the error of a socket, and ends its connection.
+                    if readable and not connection.closed:
                         await self._read(connection, budget)
+                    if writable and not connection.closed:
+                        connection.flush()
                 await budget.give_way()
 
     async def _read(self, connection: Connection, budget: TurnBudget) -> None:
@@ -355,6 +358,8 @@ class LocalWire(Wire):
         self._unfinished_size -= self._unfinished.pop(connection, 0)
         if connection.dialled:
             self._dialled.pop(connection.dialled, None)
+            if connection.met and monotonic() - connection.begun > _STEADY:
+                self._retries.pop(connection.dialled, None)
             self._stirred.set()
         if connection.met:
             del self._links[connection.link]
@@ -391,7 +396,6 @@ class LocalWire(Wire):
     def _join(self, connection: Connection, theirs: Hello) -> None:
         connection.met = True
         self._strangers.pop(connection, None)
-        self._retries.pop(connection.dialled, None)
         self._links[connection.link] = connection
         if connection.hears is not None:
             self._hearers.setdefault(connection.hears, []).append(connection)
