@@ -22,7 +22,7 @@ PATIENCE = 20.0
 
 
 class Ear:
-    """What has come to one wire."""
+    """Keeps all items of one wire."""
 
     def __init__(self) -> None:
         self.items: list[tuple[str, WireItem]] = []

@@ -565,7 +565,7 @@ async def test_all_links_meet_after_processes_were_killed_stopped_and_started_an
         wire = LocalWire(DOMAIN, directory=directory)
         async with running(wire) as ear:
             everybody = {wire.id, *ids.values()}
-            views = {}
+            views: dict[str, set[str]] = {}
             with anyio.move_on_after(10):
                 while not views or any(view != everybody for view in views.values()):
                     await anyio.sleep(0.1)

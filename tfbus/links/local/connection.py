@@ -38,7 +38,7 @@ def frame_of(message: bytes) -> bytes:
 
 
 class Hello(NamedTuple):
-    """What a link says of itself.
+    """The first message of a link, which names it.
 
     Attributes
     ----------
@@ -247,7 +247,7 @@ class Connection:
         else:
             del self.tail[:at]
 
-    # Who is there
+    # Meeting
 
     def prove(self) -> bytes:
         """This side's proof that it knows the key: a code over both hellos, of which each has a number of its own."""

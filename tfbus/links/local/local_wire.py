@@ -107,12 +107,12 @@ class LocalWire(Wire):
         self._listener: socket.socket | None = None
         self._accepts = False
         self._connections: set[Connection] = set()
-        # Those that are met, by the ids of the others and by the channels that these hear.
+        # The met ones, by the ids of the others and by the channels that these hear.
         self._links: dict[str, Connection] = {}
         self._hearers: dict[str, list[Connection]] = {}
-        # Those that have connected here and are not met, the oldest first.
+        # The ones that others have made and that are not met, the oldest first.
         self._strangers: dict[Connection, None] = {}
-        # Those with the beginning of a message, and its length; the one that has grown last is the last.
+        # The ones with the beginning of a message, and its length; the one that has grown last is the last.
         self._unfinished: dict[Connection, int] = {}
         self._unfinished_size = 0
         self._dialled: dict[str, Connection] = {}
