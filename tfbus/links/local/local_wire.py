@@ -166,10 +166,10 @@ class LocalWire(Wire):
         finally:
             for connection in self._connections:
                 connection.close()
+            self._poll.close()
             self._forget()
 
     def _forget(self) -> None:
-        self._poll.close()
         for held in (self._connections, self._links, self._hearers, self._strangers, self._unfinished, self._dialled):
             held.clear()
         self._buffer = memoryview(b"")
@@ -219,6 +219,7 @@ class LocalWire(Wire):
         except FileNotFoundError:
             try:
                 self._listen()
+                self._stirred.set()
             except OSError as error:
                 self._warn_once(error)
             return
@@ -416,6 +417,7 @@ class LocalWire(Wire):
             self._listener = None
         for connection in self._connections:
             connection.abandon()
+        self._poll.abandon()
         self._forget()
 
 

@@ -23,6 +23,12 @@ class Poll:
         fileno = getattr(self._selector, "fileno", None)
         self._file: int | None = None if fileno is None else fileno()
         self._changed = anyio.Event()
+        # An asyncio loop watches the file all the time: to begin and end that for each message costs a third more.
+        loop = anyio.lowlevel.current_token().native_token
+        self._loop: Any = loop if self._file is not None and hasattr(loop, "add_reader") else None
+        self._ready: Any = None
+        if self._loop is not None:
+            self._loop.add_reader(self._file, self._wake)
 
     def add(self, sock: socket.socket, owner: object) -> None:
         """Wait for bytes on a socket too."""
@@ -50,6 +56,10 @@ class Poll:
 
     async def wait(self) -> None:
         """Wait until a socket may be ready."""
+        if self._loop is not None:
+            self._ready = self._loop.create_future()
+            await self._ready
+            return
         if self._file is not None:
             await anyio.wait_readable(self._file)
             return
@@ -71,6 +81,16 @@ class Poll:
                 if key.events & EVENT_WRITE:
                     tasks.start_soon(watch, lambda sock=key.fileobj: anyio.wait_writable(sock))
 
+    def _wake(self) -> None:
+        if self._ready is not None and not self._ready.done():
+            self._ready.set_result(None)
+
     def close(self) -> None:
-        """Wait for nothing any more. In a child process this leaves the parent's sockets as they are."""
+        """Wait for nothing any more."""
+        if self._loop is not None:
+            self._loop.remove_reader(self._file)
+        self.abandon()
+
+    def abandon(self) -> None:
+        """Close the file in a child process, and leave what the parent waits for as it is."""
         self._selector.close()
