@@ -1,0 +1,735 @@
+"""Links of one machine at the seam below them, over real sockets."""
+
+import gc
+import os
+import resource
+import selectors
+import shutil
+import signal
+import socket
+import struct
+import sys
+import tempfile
+import threading
+import tracemalloc
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
+from pathlib import Path
+from random import Random
+from time import monotonic
+
+import anyio
+import anyio.lowlevel
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.local_links import ALL, Ear, RawPeer, files_in, framed, running
+from support.processes import OPEN_FILES, Program
+
+from tfbus.links.local import LocalWire
+from tfbus.links.local.local_wire import MOST_STRANGERS, MOST_UNFINISHED, matches
+from tfbus.links.wire import MAX_MESSAGE, Hearing, Joined, Left
+
+pytestmark = pytest.mark.anyio
+
+DOMAIN = "domain"
+
+
+@asynccontextmanager
+async def pair(directory: str, loopback: bool = False) -> AsyncIterator[tuple[LocalWire, Ear, LocalWire, Ear]]:
+    """Two links that have met."""
+    one, two = (LocalWire(DOMAIN, robot, directory=directory, loopback=loopback) for robot in ("one", "two"))
+    async with running(one) as ear_one, running(two) as ear_two:
+        await ear_one.joined(two.id)
+        await ear_two.joined(one.id)
+        yield one, ear_one, two, ear_two
+
+
+@asynccontextmanager
+async def raw_peer(
+    directory: str, *, loopback: bool = False, receive_buffer: int | None = None
+) -> AsyncIterator[tuple[LocalWire, Ear, RawPeer]]:
+    """A link, and a peer that has met it."""
+    wire = LocalWire(DOMAIN, "robot", directory=directory, loopback=loopback)
+    async with running(wire) as ear:
+        peer = await RawPeer.connect(files_in(directory)[0], DOMAIN, receive_buffer)
+        async with peer.stream:
+            await peer.meet()
+            await ear.joined(peer.link)
+            yield wire, ear, peer
+
+
+# Meeting and hearing
+
+
+@pytest.mark.every_loop
+async def test_two_links_meet_and_what_they_publish_and_send_arrives(directory: str, loopback: bool) -> None:
+    async with pair(directory, loopback) as (one, ear_one, two, ear_two):
+        assert one.publish("all", b"to all")
+        assert two.send(one.id, b"to one")
+        await ear_one.until(lambda: len(ear_one.items) == 2)
+        await ear_two.until(lambda: len(ear_two.items) == 2)
+        assert ear_one.items == [(two.id, Joined("two")), (two.id, b"to one")]
+        assert ear_two.items == [(one.id, Joined("one")), (one.id, b"to all")]
+    assert (one.publish("all", b""), two.send(one.id, b"")) == (False, False)
+    assert files_in(directory) == []
+
+
+async def test_a_link_hears_the_channel_of_the_first_pattern_that_fits_and_of_others_only_what_is_sent_to_it(
+    directory: str,
+) -> None:
+    hearing = [Hearing("arm*", "few"), Hearing("a*", "all")]
+    async with AsyncExitStack() as stack:
+        wires = {robot: LocalWire(DOMAIN, robot, directory=directory) for robot in ("arm 1", "ant", "bee")}
+        ears = {robot: await stack.enter_async_context(running(wire)) for robot, wire in wires.items()}
+        listener = LocalWire(DOMAIN, directory=directory)
+        ear = await stack.enter_async_context(running(listener, hearing))
+        for each in ears.values():
+            await each.joined(listener.id)
+        told = {
+            robot: [wire.publish(channel, channel.encode()) for channel in ("few", "all")]
+            for robot, wire in wires.items()
+        }
+        for wire in wires.values():
+            assert wire.send(listener.id, b"sent")
+        await ear.until(lambda: all(b"sent" in ear.messages(wire.id) for wire in wires.values()))
+        assert told == {"arm 1": [True, True], "ant": [False, True], "bee": [False, True]}
+        heard = {robot: ear.messages(wire.id) for robot, wire in wires.items()}
+        assert heard == {"arm 1": [b"few", b"sent"], "ant": [b"all", b"sent"], "bee": [b"sent"]}
+        assert set(ear.present()) == {wires["arm 1"].id, wires["ant"].id}
+
+
+@pytest.mark.parametrize(
+    ("pattern", "robots"),
+    [
+        ("", [""]),
+        ("*", ["", "a", "ab", "a*b", "axxbxc"]),
+        ("a", ["a"]),
+        ("a*", ["a", "ab", "a*b", "axxbxc"]),
+        ("a*b", ["ab", "a*b"]),
+        ("a*b*c", ["axxbxc"]),
+        ("*b", ["ab", "a*b"]),
+        ("ab*b", []),
+    ],
+)
+def test_a_star_in_a_pattern_stands_for_any_letters(pattern: str, robots: list[str]) -> None:
+    assert [robot for robot in ("", "a", "ab", "a*b", "axxbxc") if matches(robot, pattern)] == robots
+
+
+async def test_many_links_that_open_at_once_all_meet(directory: str) -> None:
+    wires = [LocalWire(DOMAIN, directory=directory) for _ in range(12)]
+    async with AsyncExitStack() as stack:
+        ears = [await stack.enter_async_context(running(wire)) for wire in wires]
+        for ear in ears:
+            await ear.until(lambda ear=ear: len(ear.present()) == len(wires) - 1)  # type: ignore[misc]
+
+
+async def test_links_of_other_domains_do_not_meet(directory: str) -> None:
+    other = LocalWire("other", directory=directory)
+    async with running(other) as ear, pair(directory):
+        assert ear.items == []
+
+
+async def test_an_id_in_use_is_not_taken_over(directory: str) -> None:
+    async with pair(directory) as (one, ear_one, two, _):
+        thief = await RawPeer.connect(files_in(directory)[0], DOMAIN)
+        async with thief.stream:
+            with pytest.raises((anyio.EndOfStream, anyio.BrokenResourceError)):
+                await thief.meet(link=two.id)
+        two.send(one.id, b"still here")
+        await ear_one.until(lambda: ear_one.messages(two.id) == [b"still here"])
+        assert [item for _, item in ear_one.items].count(Left()) == 0
+
+
+async def test_a_link_that_connects_again_before_it_was_met_is_met_by_the_newer_connection(directory: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory)
+    async with running(wire) as ear:
+        first, second = [await RawPeer.connect(files_in(directory)[0], DOMAIN) for _ in range(2)]
+        async with first.stream, second.stream:
+            await first.say(first.hello())
+            assert await first.hear()
+            await second.meet(link=first.link)
+            await ear.joined(first.link)
+            assert len(await first.end()) == 1
+
+
+# Frames
+
+
+@pytest.mark.every_loop
+async def test_frames_that_come_in_pieces_are_put_together(directory: str) -> None:
+    random = Random(1)
+    messages = [random.randbytes(random.choice([0, 1, 3, 5, 200])) for _ in range(40)]
+    stream = framed(*messages)
+    async with raw_peer(directory) as (_, ear, peer):
+        at = 0
+        while at < len(stream):
+            piece = random.choice([1, 2, 3, 7, 300])
+            await peer.stream.send(stream[at : at + piece])
+            await anyio.lowlevel.checkpoint()
+            at += piece
+        await ear.until(lambda: len(ear.messages(peer.link)) == len(messages))
+        assert ear.messages(peer.link) == messages
+
+
+@pytest.mark.every_loop
+async def test_no_frame_tears_where_the_socket_has_little_room(directory: str, loopback: bool) -> None:
+    random = Random(2)
+    published = [b"p" + random.randbytes(random.choice([10, 3_000, 70_000, 300_000])) for _ in range(60)]
+    sent = [b"s" + random.randbytes(random.choice([10, 3_000, 70_000])) for _ in range(30)]
+    async with raw_peer(directory, loopback=loopback, receive_buffer=4_096) as (wire, _, peer):
+        heard: list[bytes] = []
+
+        async def say() -> None:
+            for number, message in enumerate(published):
+                wire.publish("all", message)
+                if number % 2:
+                    assert wire.send(peer.link, sent[number // 2])
+                if number % 5 == 0:
+                    await anyio.lowlevel.checkpoint()
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(say)
+            while sum(message[:1] == b"s" for message in heard) < len(sent) or heard[-1] != published[-1]:
+                heard.append(await peer.hear())
+        assert [message for message in heard if message[:1] == b"s"] == sent
+        rest = [message for message in heard if message[:1] == b"p"]
+        assert [message for message in published if message in set(rest)] == rest
+
+
+async def test_the_oldest_published_messages_are_dropped_for_a_link_that_does_not_read_and_sent_ones_go_first(
+    directory: str,
+) -> None:
+    size = 100_000
+    async with raw_peer(directory) as (wire, _, peer):
+        for number in range(300):
+            assert wire.publish("all", struct.pack("<I", number) + bytes(size))
+        assert wire.send(peer.link, b"sent")
+        heard: list[int] = []
+        while not heard or heard[-1] != 299:
+            message = await peer.hear()
+            heard.append(-1 if message == b"sent" else struct.unpack_from("<I", message)[0])
+        # What the system and a frame that has been begun hold comes before.
+        before = heard.index(-1)
+        assert before < 30
+        assert heard[:before] == list(range(before))
+        waited = heard[before + 1 :]
+        assert waited == list(range(waited[0], 300))
+        assert 2**23 - 2 * size < len(waited) * size <= 2**23
+
+
+async def test_sending_to_a_link_that_does_not_read_is_refused_when_too_much_waits(directory: str) -> None:
+    async with raw_peer(directory) as (wire, _, peer):
+        accepted = sum(wire.send(peer.link, bytes(2**20)) for _ in range(50))
+        assert 15 <= accepted <= 18
+        for _ in range(accepted):
+            assert await peer.hear() == bytes(2**20)
+        assert wire.send(peer.link, b"again")
+
+
+async def test_a_message_may_be_as_long_as_any(directory: str) -> None:
+    async with pair(directory) as (one, ear_one, two, _):
+        message = bytes(MAX_MESSAGE)
+        assert two.send(one.id, message)
+        assert not two.send(one.id, message + b"1")
+        assert not two.publish("all", message + b"1")
+        await ear_one.until(lambda: ear_one.messages(two.id) == [message])
+
+
+async def test_a_longer_message_ends_its_connection_and_no_other(directory: str) -> None:
+    async with pair(directory) as (one, ear, two, _):
+        peer = await RawPeer.connect(files_in(directory)[0], DOMAIN)
+        async with peer.stream:
+            await peer.meet()
+            await ear.joined(peer.link)
+            await peer.stream.send(struct.pack("<I", MAX_MESSAGE + 1))
+            await ear.left(peer.link)
+            assert ear.refused(peer.link) == ["oversized"]
+        two.send(one.id, b"still here")
+        await ear.until(lambda: ear.messages(two.id) == [b"still here"])
+
+
+async def test_of_messages_that_never_end_the_idlest_is_given_up_when_all_are_too_large(directory: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory)
+    part = 2**22
+    async with AsyncExitStack() as stack:
+        ear = await stack.enter_async_context(running(wire))
+        peers = []
+        for _ in range(MOST_UNFINISHED // part + 1):
+            peer = await RawPeer.connect(files_in(directory)[0], DOMAIN)
+            peers.append(peer)
+            await stack.enter_async_context(peer.stream)
+            await peer.meet()
+            await ear.joined(peer.link)
+        for peer in peers:
+            await peer.stream.send(struct.pack("<I", MAX_MESSAGE) + bytes(part))
+        await ear.until(lambda: Left() in [item for _, item in ear.items])
+        (refused,) = [peer for peer in peers if ear.refused(peer.link)]
+        await peers[-1].stream.send(bytes(MAX_MESSAGE - part))
+        await ear.until(lambda: ear.messages(peers[-1].link) == [bytes(MAX_MESSAGE)])
+        assert refused is not peers[-1]
+
+
+@pytest.mark.every_loop
+async def test_a_link_that_floods_leaves_other_tasks_their_turns(directory: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory)
+    most, since_turn, total = 0, 0, 0
+
+    def receive(_: str, item: object) -> None:
+        nonlocal most, since_turn, total
+        if isinstance(item, bytes):
+            until = monotonic() + 0.0002
+            while monotonic() < until:
+                pass
+            since_turn, total = since_turn + 1, total + 1
+            most = max(most, since_turn)
+
+    try:
+        await wire.open(ALL, receive, lambda _: None)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(wire.run)
+            peer = await RawPeer.connect(files_in(directory)[0], DOMAIN)
+            async with peer.stream:
+                await peer.meet()
+                tasks.start_soon(peer.say, *[b"1"] * 1_000)
+                while total < 1_000:
+                    await anyio.lowlevel.checkpoint()
+                    since_turn = 0
+            tasks.cancel_scope.cancel()
+    finally:
+        await wire.close()
+    # A turn has 1 ms.
+    assert most <= 12
+
+
+# Strangers
+
+
+@given(noise=st.lists(st.binary(max_size=200), max_size=4), framed_=st.booleans())
+def test_noise_of_a_stranger_changes_nothing(noise: list[bytes], framed_: bool) -> None:
+    async def main() -> None:
+        with tempfile.TemporaryDirectory(prefix="tfbus-") as directory:
+            wire = LocalWire(DOMAIN, directory=directory)
+            async with running(wire) as ear:
+                stranger = await RawPeer.connect(files_in(directory)[0], DOMAIN)
+                async with stranger.stream:
+                    await stranger.stream.send(framed(*noise) if framed_ else b"".join(noise))
+                peer = await RawPeer.connect(files_in(directory)[0], DOMAIN)
+                async with peer.stream:
+                    await peer.meet()
+                    await ear.joined(peer.link)
+                    assert list(ear.present()) == [peer.link]
+
+    anyio.run(main)
+
+
+async def test_of_many_strangers_the_oldest_make_room(directory: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory)
+    async with AsyncExitStack() as stack:
+        ear = await stack.enter_async_context(running(wire))
+        strangers = []
+        for _ in range(MOST_STRANGERS + 1):
+            strangers.append(await RawPeer.connect(files_in(directory)[0], DOMAIN))
+            await stack.enter_async_context(strangers[-1].stream)
+            await anyio.lowlevel.checkpoint()
+        assert await strangers[0].end() == []
+        # The last one is among those that were kept.
+        await strangers[-1].meet()
+        await ear.joined(strangers[-1].link)
+
+
+@pytest.mark.thorough
+async def test_a_stranger_that_says_nothing_is_sent_away(directory: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory)
+    async with running(wire):
+        stranger = await RawPeer.connect(files_in(directory)[0], DOMAIN)
+        async with stranger.stream:
+            assert await stranger.end() == []
+
+
+async def test_a_hello_without_end_is_cut_off(directory: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory)
+    async with running(wire):
+        stranger = await RawPeer.connect(files_in(directory)[0], DOMAIN)
+        async with stranger.stream:
+            await stranger.stream.send(struct.pack("<I", 2**14 + 1))
+            assert await stranger.end() == []
+
+
+async def test_a_program_on_the_loopback_that_does_not_know_the_key_is_not_heard(directory: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory, loopback=True)
+    async with running(wire) as ear:
+        stranger = await RawPeer.connect(files_in(directory)[0], DOMAIN)
+        async with stranger.stream:
+            await stranger.meet(key=bytes(32))
+            assert await stranger.end() == []
+        assert ear.items == []
+        (path,) = files_in(directory)
+        assert path.stat().st_mode & 0o777 == 0o600
+
+
+OF_ANOTHER_USER = """
+import os, socket, sys
+os.setuid(65534)
+link = socket.socket(socket.AF_UNIX)
+link.connect(sys.argv[1])
+try:
+    link.sendall(bytes(4))
+    print(len(link.recv(1)), flush=True)
+except OSError:
+    print(0, flush=True)
+"""
+
+
+@pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() != 0, reason="needs another user")
+async def test_a_process_of_another_user_cannot_talk_even_if_it_may_enter(directory: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory)
+    async with running(wire) as ear:
+        (path,) = files_in(directory)
+        for each in (path, path.parent, path.parent.parent):
+            each.chmod(0o777)
+        with Program(sys.executable, "-c", OF_ANOTHER_USER, path) as program:
+            await anyio.to_thread.run_sync(program.output.expect, "^0$")
+        await ear.until(lambda: bool(ear.warnings))
+        assert ear.items == []
+        assert isinstance(ear.warnings[0], PermissionError)
+
+
+# Faults
+
+PEER = """
+import os, signal, sys
+import anyio
+from tfbus.links.local import LocalWire
+from tfbus.links.wire import Hearing
+
+async def main():
+    wire = LocalWire("domain", "peer", directory=sys.argv[1])
+    heard = lambda link, item: print(link, item if isinstance(item, bytes) else type(item).__name__, flush=True)
+    await wire.open([Hearing("*", "all")], heard, lambda error: print(error, file=sys.stderr, flush=True))
+    child, said = 0, b"-"
+    if sys.argv[2] == "fork":
+        ours, childs = os.pipe()
+        child = os.fork()
+        if not child:
+            os.write(childs, str(wire.publish("all", b"x")).encode())
+            signal.pause()
+        said = os.read(ours, 10)
+    print("open", wire.id, child, said.decode(), flush=True)
+    await wire.run()
+
+anyio.run(main, backend=sys.argv[3])
+"""
+
+
+def start_peer(directory: str, what: str = "run", backend: str = "asyncio") -> Program:
+    return Program(sys.executable, "-c", PEER, directory, what, backend)
+
+
+async def expect(program: Program, pattern: str) -> str:
+    return await anyio.to_thread.run_sync(program.output.expect, pattern)
+
+
+async def test_the_end_of_a_killed_process_is_seen_and_its_name_removed(directory: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory)
+    with start_peer(directory) as program:
+        peer = (await expect(program, "^open")).split()[1]
+        async with running(wire) as ear:
+            await ear.joined(peer)
+            assert len(files_in(directory)) == 2
+            program.process.kill()
+            await ear.left(peer)
+            # The younger link finds nobody there.
+            with anyio.fail_after(20):
+                while len(files_in(directory)) == 2:  # noqa: ASYNC110 - nothing tells
+                    await anyio.sleep(0.01)
+
+
+async def test_a_process_that_is_stopped_is_present_and_hears_afterwards_what_was_said(directory: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory)
+    with start_peer(directory) as program:
+        peer = (await expect(program, "^open")).split()[1]
+        async with running(wire) as ear:
+            await ear.joined(peer)
+            await expect(program, "Joined")
+            program.process.send_signal(signal.SIGSTOP)
+            late = LocalWire(DOMAIN, directory=directory)
+            async with running(late) as late_ear:
+                await late_ear.joined(wire.id)
+                for number in range(2_000):
+                    assert wire.publish("all", f"message {number}".encode())
+                assert peer in ear.present()
+                program.process.send_signal(signal.SIGCONT)
+                await expect(program, f"^{wire.id} b'message 1999'")
+                await late_ear.joined(peer)
+            assert (peer, Left()) not in ear.items
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
+@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+async def test_a_child_process_holds_no_connection_open(directory: str, backend: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory)
+    with start_peer(directory, "fork", backend) as program:
+        _, peer, child, published = (await expect(program, "^open")).split()
+        try:
+            assert published == "False"
+            async with running(wire) as ear:
+                await ear.joined(peer)
+                program.process.kill()
+                await ear.left(peer)
+        finally:
+            os.kill(int(child), signal.SIGKILL)
+
+
+async def test_a_file_at_which_nobody_listens_is_removed(directory: str, loopback: bool) -> None:
+    elder = LocalWire(DOMAIN, directory=directory, loopback=loopback)
+    async with running(elder):
+        (path,) = files_in(directory)
+        if loopback:
+            with socket.create_server(("127.0.0.1", 0)) as server:
+                port = server.getsockname()[1]
+            path.with_name("0" * 24).write_text(f"{port} {'00' * 32}")
+        else:
+            with socket.socket(socket.AF_UNIX) as dead:
+                dead.bind(str(path.with_name("0" * 24)))
+        path.with_name("0" * 23 + "1").write_text("no socket")
+        younger = LocalWire(DOMAIN, directory=directory, loopback=loopback)
+        async with running(younger) as ear:
+            await ear.joined(elder.id)
+            with anyio.fail_after(20):
+                while path.with_name("0" * 24).exists():  # noqa: ASYNC110 - nothing tells
+                    await anyio.sleep(0.01)
+
+
+@pytest.mark.every_loop
+async def test_links_meet_although_the_directory_has_vanished(directory: str, loopback: bool) -> None:
+    async with pair(directory, loopback) as (one, ear_one, two, _):
+        shutil.rmtree(directory)
+        third = LocalWire(DOMAIN, directory=directory, loopback=loopback)
+        async with running(third) as ear:
+            await ear.joined(one.id)
+            await ear.joined(two.id)
+            await ear_one.joined(third.id)
+        assert two.send(one.id, b"still here")
+        await ear_one.until(lambda: ear_one.messages(two.id) == [b"still here"])
+
+
+@pytest.mark.every_loop
+async def test_links_work_where_the_system_has_no_poll_object_that_is_a_file(
+    directory: str, loopback: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As on Windows.
+    monkeypatch.setattr(selectors, "DefaultSelector", selectors.SelectSelector)
+    large = bytes(1_000_000)
+    one = LocalWire(DOMAIN, directory=directory, loopback=loopback)
+    async with running(one) as ear:
+        async with pair(directory, loopback) as (two, _, three, _):
+            await ear.joined(two.id)
+            await ear.joined(three.id)
+            assert two.send(one.id, large)
+            assert three.publish("all", b"to all")
+            await ear.until(lambda: (ear.messages(two.id), ear.messages(three.id)) == ([large], [b"to all"]))
+        await ear.left(two.id)
+        await ear.left(three.id)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("seed", range(2))
+async def test_all_links_meet_after_processes_were_killed_stopped_and_started_and_the_directory_removed(
+    directory: str, seed: int
+) -> None:
+    random = Random(seed)
+    with ExitStack() as stack:
+
+        def start() -> Program:
+            return stack.enter_context(start_peer(directory, backend=random.choice(["asyncio", "trio"])))
+
+        programs, stopped = [start() for _ in range(6)], list[Program]()
+        for _ in range(30):
+            await anyio.sleep(random.uniform(0.0, 0.3))
+            chosen = random.choice(programs)
+            match random.choice(["kill", "kill", "stop", "go on", "remove"]):
+                case "kill":
+                    chosen.process.kill()
+                    programs[programs.index(chosen)] = start()
+                case "stop":
+                    chosen.process.send_signal(signal.SIGSTOP)
+                    stopped.append(chosen)
+                case "go on" if stopped:
+                    stopped.pop().process.send_signal(signal.SIGCONT)
+                case "remove":
+                    shutil.rmtree(directory, ignore_errors=True)
+        for program in stopped:
+            program.process.send_signal(signal.SIGCONT)
+        ids = {program: (await expect(program, "^open")).split()[1] for program in programs}
+        wire = LocalWire(DOMAIN, directory=directory)
+        async with running(wire) as ear:
+            everybody = {wire.id, *ids.values()}
+            views: dict[str, set[str]] = {}
+            with anyio.move_on_after(10):
+                while not views or any(view != everybody for view in views.values()):
+                    await anyio.sleep(0.1)
+                    views = {link: {link, *present_in(program.output.text)} for program, link in ids.items()}
+                    views[wire.id] = {wire.id, *ear.present()}
+            assert views == dict.fromkeys(everybody, everybody)
+        assert [program.errors.text for program in programs] == [""] * 6
+
+
+def present_in(output: str) -> set[str]:
+    """The links that have joined and not left, by the output of a peer."""
+    present: set[str] = set()
+    for line in output.splitlines():
+        match line.split():
+            case [link, "Joined"]:
+                present.add(link)
+            case [link, "Left"]:
+                present.discard(link)
+    return present
+
+
+@pytest.mark.every_loop
+async def test_a_link_without_free_files_goes_on_and_meets_others_when_there_are_some(directory: str) -> None:
+    async with pair(directory) as (one, ear, two, _):
+        path = files_in(directory)[0]
+        limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+        with socket.socket(socket.AF_UNIX) as late:
+            lowest = os.dup(0)
+            os.close(lowest)
+            resource.setrlimit(resource.RLIMIT_NOFILE, (lowest, limits[1]))
+            try:
+                late.connect(str(path))
+                await ear.until(lambda: bool(ear.warnings))
+                assert two.send(one.id, b"still here")
+                await ear.until(lambda: ear.messages(two.id) == [b"still here"])
+            finally:
+                resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+            peer = RawPeer(await anyio.abc.SocketStream.from_socket(late.dup()), DOMAIN)
+            async with peer.stream:
+                await peer.meet()
+                await ear.joined(peer.link)
+
+
+# Opening and closing
+
+
+def folder_of(directory: str, folder: str, mode: int) -> Path:
+    place = Path(directory, folder)
+    place.mkdir(exist_ok=True)
+    place.chmod(mode)
+    return place
+
+
+def file_and_link(directory: str) -> tuple[Path, Path]:
+    file, link = Path(directory, "file"), Path(directory, "link")
+    file.touch()
+    link.symlink_to(directory)
+    return file, link
+
+
+@pytest.mark.parametrize("folder", ["", "sub"])
+async def test_a_directory_that_others_may_enter_is_refused_with_what_to_do(directory: str, folder: str) -> None:
+    place = folder_of(directory, folder, 0o755)
+    wire = LocalWire(DOMAIN, directory=str(place))
+    with pytest.raises(PermissionError, match=rf"{place} has the mode 755, .*: run chmod 700 {place}, or set TFBUS"):
+        async with running(wire):
+            pass
+
+
+@pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() != 0, reason="needs another user")
+async def test_a_directory_of_another_user_is_refused(directory: str) -> None:
+    os.chown(directory, 65534, -1)
+    with pytest.raises(PermissionError, match="belongs to the user 65534, and this process is of 0: remove it, or set"):
+        async with running(LocalWire(DOMAIN, directory=directory)):
+            pass
+
+
+async def test_a_file_or_a_symbolic_link_in_place_of_the_directory_is_refused(directory: str) -> None:
+    for place in file_and_link(directory):
+        with pytest.raises(PermissionError, match="director"):
+            async with running(LocalWire(DOMAIN, directory=str(place))):
+                pass
+
+
+async def test_a_path_that_is_too_long_for_a_socket_is_told(directory: str) -> None:
+    with pytest.raises(OSError, match="too long: set TFBUS_RUNTIME_DIR"):
+        async with running(LocalWire(DOMAIN, directory=str(Path(directory, "long" * 20)))):
+            pass
+    async with running(LocalWire(DOMAIN, directory=str(Path(directory, "long" * 20)), loopback=True)):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("variables", "expected"),
+    [
+        ({"TFBUS_RUNTIME_DIR": "{}/own", "XDG_RUNTIME_DIR": "{}/users"}, "own"),
+        ({"TFBUS_RUNTIME_DIR": "", "XDG_RUNTIME_DIR": "{}/users"}, "users/tfbus"),
+    ],
+)
+async def test_the_environment_names_the_directory(
+    variables: dict[str, str], expected: str, directory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value.format(directory))
+    async with running(LocalWire(DOMAIN)):
+        assert len(files_in(str(Path(directory, expected)))) == 1
+
+
+@pytest.mark.every_loop
+async def test_all_that_was_sent_goes_out_when_a_link_closes(directory: str) -> None:
+    one, two = (LocalWire(DOMAIN, directory=directory) for _ in range(2))
+    async with running(one) as ear:
+        async with running(two) as ear_two:
+            await ear.joined(two.id)
+            await ear_two.joined(one.id)
+            messages = [bytes(1_000_000) + str(number).encode() for number in range(5)]
+            for message in messages:
+                assert two.send(one.id, message)
+        await ear.left(two.id)
+        assert ear.messages(two.id) == messages
+
+
+@pytest.mark.thorough
+async def test_a_link_closes_although_another_does_not_read(directory: str) -> None:
+    async with AsyncExitStack() as stack:
+        with anyio.fail_after(10):
+            wire = LocalWire(DOMAIN, directory=directory)
+            async with running(wire) as ear:
+                peer = await RawPeer.connect(files_in(directory)[0], DOMAIN)
+                await stack.enter_async_context(peer.stream)
+                await peer.meet()
+                await ear.joined(peer.link)
+                for _ in range(10):
+                    assert wire.send(peer.link, bytes(1_000_000))
+
+
+async def test_a_link_may_be_closed_twice_and_without_being_opened(directory: str) -> None:
+    wire = LocalWire(DOMAIN, directory=directory)
+    await wire.close()
+    async with running(wire):
+        pass
+    await wire.close()
+    assert (wire.publish("all", b""), wire.send("0" * 32, b"")) == (False, False)
+
+
+@pytest.mark.thorough
+async def test_a_link_opened_and_closed_often_leaves_no_memory_no_files_and_no_threads(directory: str) -> None:
+    async def once() -> None:
+        async with pair(directory):
+            pass
+
+    for _ in range(20):
+        await once()
+    files, threads = len(list(OPEN_FILES.iterdir())), threading.active_count()
+    tracemalloc.start()
+    try:
+        gc.collect()
+        before = tracemalloc.get_traced_memory()[0]
+        for _ in range(250):
+            await once()
+        gc.collect()
+        left = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert left / 500 < 2_000
+    assert len(list(OPEN_FILES.iterdir())) <= files
+    assert threading.active_count() <= threads

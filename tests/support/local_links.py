@@ -1,0 +1,153 @@
+"""Links of one machine: wires of this process, and a peer of the tests that speaks their protocol itself."""
+
+import hmac
+import secrets
+import socket
+import struct
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager, suppress
+from hashlib import blake2b
+from pathlib import Path
+from typing import Self
+
+import anyio
+import anyio.abc
+
+from tfbus.links.local import LocalWire
+from tfbus.links.wire import Hearing, Joined, Left, WireItem
+from tfbus.tf_message import MalformedMessageError
+
+ALL = (Hearing("*", "all"),)
+PATIENCE = 20.0
+
+
+class Ear:
+    """Keeps all items of one wire."""
+
+    def __init__(self) -> None:
+        self.items: list[tuple[str, WireItem]] = []
+        self.warnings: list[Exception] = []
+        self._changed = anyio.Event()
+
+    def receive(self, link: str, item: WireItem) -> None:
+        self.items.append((link, item))
+        self._changed.set()
+
+    def warn(self, error: Exception) -> None:
+        self.warnings.append(error)
+        self._changed.set()
+
+    async def until(self, holds: Callable[[], bool]) -> None:
+        """Wait until something holds, which is looked at when something has come."""
+        with anyio.fail_after(PATIENCE):
+            while not holds():
+                self._changed = anyio.Event()
+                await self._changed.wait()
+
+    async def joined(self, link: str) -> None:
+        await self.until(lambda: link in self.present())
+
+    async def left(self, link: str) -> None:
+        await self.until(lambda: (link, Left()) in self.items and link not in self.present())
+
+    def present(self) -> dict[str, str]:
+        """The robots of the links that have joined and not left."""
+        here: dict[str, str] = {}
+        for link, item in self.items:
+            if isinstance(item, Joined):
+                assert link not in here
+                here[link] = item.robot
+            elif isinstance(item, Left):
+                del here[link]
+        return here
+
+    def messages(self, link: str) -> list[bytes]:
+        return [item for sender, item in self.items if sender == link and isinstance(item, bytes)]
+
+    def refused(self, link: str) -> list[str]:
+        return [
+            item.reason for sender, item in self.items if sender == link and isinstance(item, MalformedMessageError)
+        ]
+
+
+@asynccontextmanager
+async def running(wire: LocalWire, hears: Sequence[Hearing] = ALL) -> AsyncIterator[Ear]:
+    """Use a wire as a link does."""
+    ear = Ear()
+    try:
+        await wire.open(hears, ear.receive, ear.warn)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(wire.run)
+            yield ear
+            tasks.cancel_scope.cancel()
+    finally:
+        await wire.close()
+
+
+def files_in(directory: str) -> list[Path]:
+    """The files of the links of one domain."""
+    return sorted(path for folder in Path(directory).iterdir() for path in folder.iterdir())
+
+
+class RawPeer:
+    """A program that connects to a link, and does what it likes."""
+
+    def __init__(self, stream: anyio.abc.ByteStream, domain: str, key: bytes = b"") -> None:
+        self.stream = stream
+        self.link = secrets.token_hex(16)
+        self._domain = domain
+        self._key = key
+        self._read = b""
+
+    @classmethod
+    async def connect(cls, path: Path, domain: str, receive_buffer: int | None = None) -> Self:
+        """Connect to the link whose file is given, by either of the two ways."""
+        if await anyio.Path(path).is_socket():
+            return cls(await anyio.connect_unix(path), domain)
+        port, key = (await anyio.Path(path).read_text()).split()
+        sock = socket.socket()
+        if receive_buffer is not None:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
+        sock.connect(("127.0.0.1", int(port)))
+        return cls(await anyio.abc.SocketStream.from_socket(sock), domain, bytes.fromhex(key))
+
+    async def say(self, *messages: bytes) -> None:
+        await self.stream.send(framed(*messages))
+
+    async def hear(self) -> bytes:
+        """The next frame; raises `anyio.EndOfStream` at the end."""
+        while len(self._read) < 4 or len(self._read) < 4 + struct.unpack_from("<I", self._read)[0]:
+            with anyio.fail_after(PATIENCE):
+                self._read += await self.stream.receive()
+        (length,) = struct.unpack_from("<I", self._read)
+        message, self._read = self._read[4 : 4 + length], self._read[4 + length :]
+        return message
+
+    def hello(self, robot: str = "") -> bytes:
+        """A hello of this peer."""
+        start = b"tfbus local 1\n" + blake2b(self._domain.encode(), digest_size=16).digest()
+        return start + self.link.encode() + secrets.token_bytes(16) + robot.encode()
+
+    async def meet(self, robot: str = "", channel: str = "all", *, link: str = "", key: bytes | None = None) -> str:
+        """Say hello and welcome; returns the channel that the other link hears."""
+        self.link = link or self.link
+        hello = self.hello(robot)
+        await self.say(hello)
+        theirs, welcome = await self.hear(), await self.hear()
+        both = struct.pack("<I", len(hello)) + hello + theirs
+        known = self._key if key is None else key
+        await self.say(hmac.digest(known, b"dialler" + both, "sha256") + channel.encode())
+        assert (welcome[:32] == hmac.digest(known, b"listener" + both, "sha256")) is (key is None)
+        return welcome[32:].decode()
+
+    async def end(self) -> list[bytes]:
+        """All frames that still come until the other side ends the connection."""
+        heard = []
+        with suppress(anyio.EndOfStream, anyio.BrokenResourceError):
+            while True:
+                heard.append(await self.hear())
+        return heard
+
+
+def framed(*messages: bytes) -> bytes:
+    return b"".join(struct.pack("<I", len(message)) + message for message in messages)
