@@ -73,6 +73,7 @@ _NAMES_IN = {
     "geometry.stamped": ("TransformStamped",),
     "geometry.transform": ("Transform",),
     "geometry.transform_array": ("TransformArray",),
+    "links.local.local_link": ("LocalLink",),
     "message_filter.message_filter": ("MessageFilter",),
     "registration": ("Registration",),
     "robot.model": ("Joint", "LimitViolation", "Mimic", "RobotModel"),

@@ -70,6 +70,7 @@ from tfbus.events import SubscriberFailed as SubscriberFailed
 from tfbus.geometry.stamped import TransformStamped as TransformStamped
 from tfbus.geometry.transform import Transform as Transform
 from tfbus.geometry.transform_array import TransformArray as TransformArray
+from tfbus.links.local.local_link import LocalLink as LocalLink
 from tfbus.message_filter.message_filter import MessageFilter as MessageFilter
 from tfbus.registration import Registration as Registration
 from tfbus.robot.model import Joint as Joint

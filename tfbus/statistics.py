@@ -168,8 +168,6 @@ class BufferServerStatistics(PlainData):
     refused : mapping of str to int
         Questions that were refused, by reason: ``"busy"``, because too many wait or come; ``"malformed"``;
         ``"internal"``, because of an error that is none of lookups, which is logged.
-    queue : QueueStatistics
-        Questions that wait for the event loop.
     """
 
     waiting: int
@@ -177,7 +175,6 @@ class BufferServerStatistics(PlainData):
     failed: int
     cancelled: int
     refused: Mapping[str, int]
-    queue: QueueStatistics
 
 
 @dataclass(frozen=True, slots=True)

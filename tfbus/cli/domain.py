@@ -26,6 +26,8 @@ from tfbus.cli.output import say, warn
 from tfbus.clock import Clock, JumpCallback, SimulatedClock, SystemClock
 from tfbus.errors import ClockResetError, InvalidTransformError, pip_install
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.links.link import DomainLink, DomainOptions
+from tfbus.links.local import LocalLink
 from tfbus.registration import Registration
 from tfbus.stamps import SECOND, as_stamp
 
@@ -40,16 +42,35 @@ _RETRY = 1.0
 """The time between two attempts, in s."""
 _SILENCE_BEFORE_NOTICE = 1.0
 """s."""
-_NO_ZENOH = f"joining a domain needs a package more: {pip_install('cli,zenoh')}"
+_NO_ZENOH = f"--connect and --listen need a package more: {pip_install('cli,zenoh')}"
 
 
 class RemoteLookups(Protocol):
-    """The part of a `tfbus.links.zenoh.BufferClient` that commands use; the extra may be missing."""
+    """The part of a `tfbus.Buffer` that commands ask in other programs, too."""
+
+    async def lookup(
+        self,
+        target: str,
+        source: str,
+        /,
+        *,
+        timeout: float | None = None,
+        max_age: float | None = None,
+    ) -> TransformStamped:
+        """The transform in the other buffer."""
+
+
+@dataclass(frozen=True, slots=True)
+class _RobotLookups:
+    """Lookups in the buffer of one robot."""
+
+    link: DomainLink
+    robot: str | None
 
     async def lookup(
         self, target: str, source: str, /, *, timeout: float | None = None, max_age: float | None = None
     ) -> TransformStamped:
-        """The transform in the other buffer."""
+        return await self.link.lookup(target, source, robot=self.robot, timeout=timeout, max_age=max_age)
 
 
 @Parameter(name="*")
@@ -62,11 +83,10 @@ class LinkOptions:
     domain
         Only programs of the same domain hear each other.
     listen
-        Listen at this address, such as tcp/192.168.1.5:7447; may be given several times. Without any address, programs
-        on this machine find each other by themselves.
+        Run a router in this program that listens at this address, such as tcp/192.168.1.5:7447; may be given several
+        times. Without any address, programs on this machine find each other by themselves.
     connect
-        Connect to a program that listens at this address; may be given several times. Programs without an address
-        listen at tcp/127.0.0.1:17447.
+        Connect to the router at this address; may be given several times, for routers that are tried in turn.
     robot
         The robot whose frames this program publishes.
     robots
@@ -140,22 +160,13 @@ class LinkOptions:
                         raise UsageError(f"cannot join ROS at {place}: {why}") from None
                 yield
             return
-        try:
-            from tfbus.links.zenoh import ZenohLink
-        except ImportError:
-            raise UsageError(_NO_ZENOH) from None
-        async with self._entered(
-            lambda: ZenohLink(
-                bus,
-                self.domain,
-                listen=self.listen or None,
-                connect=self.connect or None,
-                robot=self.robot,
-                robots=self.robots or None,
-                clock=follower,
-                tell_clock=isinstance(bus.clock, SimulatedClock),
-            )
-        ):
+        options: DomainOptions = {
+            "robot": self.robot,
+            "robots": self.robots or None,
+            "clock": follower,
+            "tell_clock": isinstance(bus.clock, SimulatedClock),
+        }
+        async with self._entered(bus, options):
             yield
 
     def run_remote(self, program: Callable[[RemoteLookups], Awaitable[T]]) -> T:
@@ -168,35 +179,40 @@ class LinkOptions:
         KeyboardInterrupt
             After everything has ended, if Ctrl-C was pressed.
         """
-        try:
-            from tfbus.links.zenoh import BufferClient
-        except ImportError:
-            raise UsageError(_NO_ZENOH) from None
         if len(self.robots) > 1:
             raise UsageError("--remote asks the buffer of one robot: give --robots once")
-        robot = self.robots[0] if self.robots else None
+        # A robot of rate 0 says who is there, and no more.
+        options: DomainOptions = {"robots": dict.fromkeys(self.robots or ("*",), 0.0)}
 
         async def enter_and_run() -> T:
-            async with self._entered(
-                lambda: BufferClient(self.domain, robot=robot, listen=self.listen or None, connect=self.connect or None)
-            ) as remote:
-                return await program(remote)
+            async with self._entered(Bus(), options) as remote:
+                return await program(_RobotLookups(remote, self.robots[0] if self.robots else None))
 
         return run(enter_and_run, self.backend)
 
     @asynccontextmanager
-    async def _entered(self, make: Callable[[], AbstractAsyncContextManager[T]]) -> AsyncIterator[T]:
-        """Make and enter an end of the domain for the body of an ``async with``."""
+    async def _entered(self, bus: Bus, options: DomainOptions) -> AsyncIterator[DomainLink]:
+        """Make and enter a link to the domain for the body of an ``async with``."""
         async with AsyncExitStack() as stack:
             try:
-                entered = await stack.enter_async_context(make())
+                link = await stack.enter_async_context(self._link(bus, options))
             except ValueError as error:
                 raise UsageError(str(error)) from None
             except OSError as error:
-                where = " or ".join(self.listen) or "the loopback"
                 why = os.strerror(error.errno) if error.errno else error
-                raise UsageError(f"cannot listen at {where}: {why}") from None
-            yield entered
+                failed = f"cannot listen at {' or '.join(self.listen)}" if self.listen else "cannot join the domain"
+                raise UsageError(f"{failed}: {why}") from None
+            yield link
+
+    def _link(self, bus: Bus, options: DomainOptions) -> DomainLink:
+        """The link that the options ask for: on this machine, or by a router."""
+        if not self.listen and not self.connect:
+            return LocalLink(bus, self.domain, **options)
+        try:
+            from tfbus.links.zenoh import ZenohLink
+        except ImportError:
+            raise UsageError(_NO_ZENOH) from None
+        return ZenohLink(bus, self.domain, listen=self.listen or None, connect=self.connect or None, **options)
 
     async def first_transform(self, bus: Bus) -> None:
         """Wait until something is published on the bus, with a notice if that takes more than a second."""

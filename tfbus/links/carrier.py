@@ -1,7 +1,7 @@
 """The seam below a link to another world, such as ROS, and the queue of what comes from there.
 
-A carrier writes and reads messages of its world; see `tfbus.links.wire` for the seam below links between buses of tfbus,
-whose messages are the same over every network.
+A carrier writes and reads messages of its world; see `tfbus.links.wire` for the seam below links between buses of
+tfbus, whose messages are the same over every network.
 """
 
 import enum

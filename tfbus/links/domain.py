@@ -185,8 +185,8 @@ class DomainEnd(Endpoint):
         now = self._now()
         question = self._agreement.question(now)
         if question is not None:
-            frames = sorted(self.frames) if self.frames is not None and self._filters else None
-            if not self._wire.send(question.peer, write_text(Kind.QUESTION, {"since": question.since, "frames": frames})):
+            frames = sorted(self.frames) if self.frames is not None and self._filters else None if not
+            self._wire.send(question.peer, write_text(Kind.QUESTION, {"since": question.since, "frames": frames})):
                 self._agreement.unanswered(question.peer, now)
         if now >= self._signed_at + self._sign_period:
             peers = len(self.peers.present)

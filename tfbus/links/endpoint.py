@@ -5,7 +5,7 @@ tfbus, over a wire. Nothing that a peer sends makes either of them raise.
 """
 
 import logging
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from copy import copy
 from math import inf
 from typing import Any, Protocol
@@ -245,7 +245,7 @@ class ForeignEnd(Endpoint):
         bus: Bus,
         name: str,
         carrier: Carrier,
-        frames: Collection[str] | None = None,
+        frames: Iterable[str] | None = None,
         drop_lost: bool = False,
         max_frames: int = 10_000,
     ) -> None:

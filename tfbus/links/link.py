@@ -3,10 +3,11 @@
 import logging
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from time import monotonic
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypedDict
 from weakref import finalize
 
 import anyio
@@ -34,6 +35,7 @@ from tfbus.statistics import LinkStatistics
 from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.lookup import Hold, policy_of
 
+_LONGEST_NAME = 200
 _FULL_TURN = 5_000
 """So many samples and removals are sent at once, before the turn of the event loop ends."""
 
@@ -266,6 +268,21 @@ class Link:
             self._end.clock_jumped_back()
 
 
+class DomainOptions(TypedDict, total=False):
+    """The parameters that all links of tfbus have in common; `DomainLink` explains them."""
+
+    robot: str | None
+    robots: Iterable[str] | Mapping[str, float] | None
+    slow_rate: float
+    frames: Iterable[str] | None
+    drop_lost: bool
+    max_frames: int
+    capacity: int
+    history: float | None
+    clock: SimulatedClock | HearsTime | None
+    tell_clock: bool
+
+
 class DomainLink(Link):
     """Joins a bus to the other buses of a domain; what all links of tfbus have in common.
 
@@ -313,6 +330,23 @@ class DomainLink(Link):
     robot : str or None
     id : str
         The name of this end for its peers.
+
+    Raises
+    ------
+    ValueError
+        If the name of a robot is malformed, or a number is out of range.
+    TypeError
+        If `frames` or `robots` is one name, or a number is of another type.
+    OSError
+        On entering, if there is no network.
+    BusClosedError, RuntimeError
+        On entering, if the bus is closed; if it belongs to another thread, or the link was entered before.
+
+    Notes
+    -----
+    Nothing here blocks the event loop: while the network is congested, live messages are dropped, which the other end
+    counts as `lost`. Static frames, removals and the newest sample of each moving frame are recovered, see
+    `tfbus.links.replica`. Whoever can reach the link can publish and remove any frame.
     """
 
     def __init__(
@@ -334,7 +368,11 @@ class DomainLink(Link):
     ) -> None:
         if isinstance(robots, str):
             raise TypeError(f"robots must be several names, not {robots!r}")
+        if robot is not None:
+            check_robot(robot)
         rates = robots if isinstance(robots, Mapping) else dict.fromkeys(("*",) if robots is None else robots, math.inf)
+        for pattern in rates:
+            check_robots(pattern)
         # Not a number is not greater either.
         if not slow_rate > 0 or any(not rate >= 0 for rate in rates.values()):
             raise ValueError(f"a rate must be greater than zero, got {rates!r} and {slow_rate!r} Hz")
@@ -342,7 +380,7 @@ class DomainLink(Link):
             raise ValueError("slow_rate must be finite")
         if history is not None and not 0 < as_duration(history, "history") <= LONGEST_HISTORY:
             raise ValueError(f"history must be a time that passes, {LONGEST_HISTORY:g} s at most, got {history}")
-        self.domain = domain
+        self.domain = check_domain(domain)
         self.robot = robot
         self._domain_end = DomainEnd(
             bus,
@@ -425,3 +463,29 @@ class DomainLink(Link):
             hold=None if extrapolate is None else float(extrapolate.max_age),
         )
         return await self.lookups.ask(question, robot, limit)
+
+
+def check_domain(domain: str) -> str:
+    """Return the name of a domain; raises `ValueError` if it is malformed."""
+    if len(domain) > _LONGEST_NAME or not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", domain, re.ASCII):
+        raise ValueError(
+            "a domain is made of letters, digits, '-', '_' and '.', with '/' between them, "
+            f"{_LONGEST_NAME} at most, not {domain!r}"
+        )
+    return domain
+
+
+def check_robot(robot: str) -> str:
+    """Return the name of a robot; raises `ValueError` if it is malformed."""
+    if len(robot) > _LONGEST_NAME or not re.fullmatch(r"[\w.-]+", robot, re.ASCII):
+        raise ValueError(
+            f"a robot's name is made of letters, digits, '-', '_' and '.', {_LONGEST_NAME} at most, not {robot!r}"
+        )
+    return robot
+
+
+def check_robots(pattern: str) -> str:
+    """Return a pattern for the names of robots; raises `ValueError` if no name can match it."""
+    if len(pattern) > _LONGEST_NAME or not re.fullmatch(r"[\w.*-]+", pattern, re.ASCII):
+        raise ValueError(f"the name of a robot, or a pattern such as 'r*', is needed, not {pattern!r}")
+    return pattern

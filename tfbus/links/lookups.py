@@ -17,10 +17,9 @@ import anyio.abc
 
 from tfbus._aio.task_groups import close_task_group
 from tfbus.buffer.buffer import Buffer
-from tfbus.buffer.lookups import MAY_COME
 from tfbus.bus.queues import check_capacity
 from tfbus.bus.subscribers import OnceLogger
-from tfbus.errors import LookupTimeoutError, RemoteLookupError, TransformError, TransformLookupError
+from tfbus.errors import MAY_COME, LookupTimeoutError, RemoteLookupError, TransformError, TransformLookupError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.message import Kind, write_body
 from tfbus.links.remote_lookup import (
@@ -367,7 +366,7 @@ class BufferServer:
                 raise answer
             message = write_answer(answer)
         except Exception as error:  # noqa: BLE001 - the next question is answered
-            self._log.warning(type(error), "a lookup of another process failed", exc_info=error)
+            self._log.warning(type(error).__name__, "a lookup of another process failed", exc_info=error)
             self._refuse(*key, "internal", f"the lookup failed there with {type(error).__name__}")
         else:
             self._counts["failed" if isinstance(answer, Exception) else "answered"] += 1
@@ -405,4 +404,3 @@ def _arguments(question: RemoteQuestion) -> dict[str, Any]:
         "max_gap": question.max_gap,
         "extrapolate": None if question.hold is None else Hold(question.hold),
     }
-

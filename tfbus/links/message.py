@@ -14,9 +14,9 @@ sender holds. The samples themselves are a TFMessage behind that. Little endian:
         removal  the length of the name in place of runs, UTF-8
     samples      a TFMessage with the samples of all batches, in their order
 
-The kinds are those of `tfbus.links.replica`, and those of the past and of lookups. Questions are JSON behind version and
-kind; see `tfbus.links.lookups` for theirs. Reading a message costs time in proportion to its bytes; handling an entry may cost more, so both have a
-limit.
+The kinds are those of `tfbus.links.replica`, and those of the past and of lookups. Questions are JSON behind version
+and kind; see `tfbus.links.lookups` for theirs. Reading a message costs time in proportion to its bytes; handling an
+entry may cost more, so both have a limit.
 """
 
 import enum
@@ -267,7 +267,7 @@ class _Batch(NamedTuple):
     runs: tuple[tuple[str, bool, int], ...]
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         return sum(count for _, _, count in self.runs)
 
 
@@ -308,7 +308,7 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
         raise MalformedMessageError("head", detail) from None
     except UnicodeDecodeError:
         raise MalformedMessageError("head", "a name in a message is no UTF-8") from None
-    count = sum(entry.count for entry in told if isinstance(entry, _Batch))
+    count = sum(entry.size for entry in told if isinstance(entry, _Batch))
     # A number that the data cannot hold is malformed, and is told as such.
     if MAX_SAMPLES < count <= len(data) // MIN_SIZE:
         raise MalformedMessageError("oversized", f"a message of {count} samples, more than {MAX_SAMPLES}")
@@ -339,9 +339,9 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
             size += 1
             heard.entries.append(entry)
             continue
-        valid = [sample for sample in samples[place : place + entry.count] if sample is not None]
-        place += entry.count
-        size += 1 + entry.count
+        valid = [sample for sample in samples[place : place + entry.size] if sample is not None]
+        place += entry.size
+        size += 1 + entry.size
         authorities = [authority for authority, _, _ in entry.runs]
         heard.entries.append(ReceivedBatch(valid, authorities, entry.origin, entry.sequence))
     yield heard
@@ -411,4 +411,3 @@ def _read_head(kind: Kind, data: bytes) -> tuple[Heard, list[_Batch | RemovedFra
         raise IndexError
     claim = Claim(since, sequence, digest, bool(flags & _FINAL), bool(flags & _PARTIAL))
     return Heard(kind, bus, number, claim, time, reach, bool(flags & _SERVES), []), entries, at
-

@@ -109,7 +109,7 @@ class Outbox:
         if goes_out:
             self._entries.append(removal)
             self.pending += 1
-        if self._follow_removal(removal, echo, withdrawn) or goes_out:
+        if self._follow_removal(removal.frame, (removal.sequence, removal.origin) if goes_out else None) or goes_out:
             self._notify()
 
     def tell_time(self, stamp: int) -> None:
@@ -131,8 +131,8 @@ class Outbox:
     def keep(self, batch: OutgoingBatch) -> None:
         """Note samples of a lost bus, which are not on this bus, for whoever shows them."""
 
-    def own_sample(self, frame: str) -> TransformStamped | None:
-        """The newest sample of a frame that this link has to say again if somebody has outnumbered it."""
+    def own_sample(self, _frame: str, /) -> TransformStamped | None:
+        """The newest sample of a frame that this bus has to say again if somebody has outnumbered it."""
         return None
 
     def ways(self) -> Iterable[tuple[bytes, tuple[bytes, ...]]]:
@@ -144,11 +144,14 @@ class Outbox:
 
     def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
         """Note the frames of a batch for late joiners; returns whether anything changes for these."""
-        return False
+        raise NotImplementedError
 
-    def _follow_removal(self, removal: RemovedFrame, echo: bool, withdrawn: bool) -> bool:
-        """Note a removal for late joiners; returns whether anything changes for these."""
-        return False
+    def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
+        """Note for late joiners that a frame has gone; returns whether anything changes for these.
+
+        There is no rank if the other ends know it, because they have said so or see that its owner was lost.
+        """
+        raise NotImplementedError
 
     def _take_statics(self) -> dict[str, TransformStamped | None]:
         return {}
@@ -179,11 +182,12 @@ class LatchingOutbox(Outbox):
                 changed = True
         return changed
 
-    def _follow_removal(self, removal: RemovedFrame, echo: bool, withdrawn: bool) -> bool:
-        if removal.frame not in self._kept:
+    def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
+        del rank
+        if frame not in self._kept:
             return False
-        self._kept.remove(removal.frame)
-        self._changes[removal.frame] = None
+        self._kept.remove(frame)
+        self._changes[frame] = None
         return True
 
     def _take_statics(self) -> dict[str, TransformStamped | None]:

@@ -458,4 +458,3 @@ class Agreement:
 
     def _due_of(self, peer: str) -> float:
         return self._copies[peer].due
-

@@ -135,14 +135,15 @@ class LocalWire(Wire):
             tasks.start_soon(self._move)
             tasks.start_soon(self._meet)
 
-    def publish(self, channel: str, message: bytes) -> bool:
+    def is_heard(self, channel: str) -> bool:
+        return bool(self._hearers.get(channel))
+
+    def publish(self, channel: str, message: bytes) -> None:
         hearers = self._hearers.get(channel)
-        if not hearers or len(message) > MAX_MESSAGE:
-            return False
-        frame = frame_of(message)
-        for connection in hearers:
-            connection.publish(frame)
-        return True
+        if hearers and len(message) <= MAX_MESSAGE:
+            frame = frame_of(message)
+            for connection in hearers:
+                connection.publish(frame)
 
     def send(self, link: str, message: bytes) -> bool:
         connection = self._links.get(link)

@@ -27,12 +27,12 @@ import zenoh.ext
 
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.links.carrier import Received
 from tfbus.links.ros.ros_link import RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, as_domain, settings_of
 from tfbus.links.zenoh._closing import begin_to_close, close_session, use_zenoh, wait_until_closed
-from tfbus.links.zenoh._opening import directly, refusal
-from tfbus.links.zenoh._settings import without_source_location
-from tfbus.tf_message import encode
+from tfbus.links.zenoh.addresses import without_source_location
+from tfbus.tf_message import MalformedMessageError, encode
 
 TYPE: Final = "tf2_msgs::msg::dds_::TFMessage_"
 HASH: Final = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
@@ -209,7 +209,20 @@ class RmwZenohCarrier(RosCarrier):
         )
 
     def _directly(self, take: Callable[[zenoh.Sample], None]) -> Any:
-        return directly(take, lambda error: self._receive(refusal(error, _AUTHORITY)))
+        """Have a callback called in zenoh's thread; what it raises is received as a refusal, for zenoh would print it."""
+
+        def call(sample: zenoh.Sample) -> None:
+            try:
+                take(sample)
+            except Exception as error:  # noqa: BLE001 - see above
+                if not isinstance(error, MalformedMessageError):
+                    detail = f"{type(error).__name__}: {error}"[:200]
+                    error = MalformedMessageError("unreadable", detail)
+                # The traceback would keep what was sent.
+                self._receive(Received(_AUTHORITY, error.with_traceback(None)))
+
+        # Otherwise each subscriber has a thread of its own, and one overtakes the other.
+        return zenoh.handlers.Callback(call, indirect=False)
 
     async def close(self) -> None:
         """Close the session, or give up waiting for that."""

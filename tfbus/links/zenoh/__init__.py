@@ -1,4 +1,4 @@
-"""Links over zenoh, peer to peer or through a router, and lookups in other processes; with ``tfbus[zenoh]``."""
+"""Links to other machines by zenoh's routers; with ``tfbus[zenoh]``."""
 
 from tfbus.errors import pip_install
 
@@ -7,9 +7,7 @@ try:
 except ImportError:
     raise ImportError(f"a link over zenoh needs a package more: {pip_install('zenoh')}") from None
 
-from tfbus.links.zenoh.buffer_client import BufferClient
-from tfbus.links.zenoh.buffer_server import BufferServer
-from tfbus.links.zenoh.router import ZenohRouter
 from tfbus.links.zenoh.zenoh_link import ZenohLink
+from tfbus.links.zenoh.zenoh_router import ZenohRouter
 
-__all__ = ["BufferClient", "BufferServer", "ZenohLink", "ZenohRouter"]
+__all__ = ["ZenohLink", "ZenohRouter"]

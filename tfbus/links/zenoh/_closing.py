@@ -78,11 +78,6 @@ async def wait_until_closed(closing: Sequence[threading.Thread]) -> TimeoutError
     return TimeoutError(f"zenoh has not closed its session within {CLOSING_TIME:g} s, and goes on in the background")
 
 
-def wait_at_exit(thread: threading.Thread) -> None:
-    """Have the interpreter, at its end, wait for a thread that is to end."""
-    thread.name = _NAME
-
-
 class Keeper:
     """The thread in which a wire or a router opens and closes its sessions, because zenoh's calls block.
 

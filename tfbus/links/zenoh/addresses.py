@@ -106,7 +106,7 @@ def _config(values: dict[str, Any], config: Mapping[str, Any] | None, lease: flo
         try:
             result.insert_json5(path, json.dumps(value))
         except (zenoh.ZError, TypeError) as error:
-            why = _without_source_location(error)
+            why = without_source_location(error)
             raise ValueError(f"zenoh does not take {value!r} for its setting {path!r}: {why}") from None
     return result
 
@@ -136,7 +136,7 @@ def open_session(config: zenoh.Config) -> zenoh.Session:
 
 def os_error(error: BaseException, what: str) -> OSError:
     """An error of zenoh as the operating system's, with its `errno` if it names one."""
-    text = f"{what}: {_without_source_location(error)}"
+    text = f"{what}: {without_source_location(error)}"
     number = re.search(r"\(os error (\d+)\)", text)
     return OSError(int(number[1]), text) if number else OSError(text)
 
@@ -152,5 +152,5 @@ def endpoints(addresses: Addresses) -> list[str]:
     return found
 
 
-def _without_source_location(error: BaseException) -> str:
+def without_source_location(error: BaseException) -> str:
     return re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).strip()

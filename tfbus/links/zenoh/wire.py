@@ -59,7 +59,7 @@ from tfbus.links.zenoh.addresses import (
 from tfbus.tf_message import MalformedMessageError
 
 MAX_LINKS: Final = 10_000
-MAX_CHANNELS: Final = 32
+MAX_CHANNELS: Final = 128
 FIRST_WAIT: Final = 1.0
 """s; `ZenohWire.open` waits so long for a router."""
 SETTLED: Final = 1.0
@@ -115,8 +115,8 @@ class ZenohWire:
         lease: float | None = None,
     ) -> None:
         self.id = os.urandom(16).hex()
-        self._domain = f"tfbus/{check_domain(domain)}"
-        self._own = f"{self._domain}/{check_robot(robot) if robot else NO_ROBOT}"
+        self._domain = f"tfbus/{domain}"
+        self._own = f"{self._domain}/{robot or NO_ROBOT}"
         self._addresses = deque(endpoints(connect or ()))
         self._is_router = listen is not None
         if listen is not None:
@@ -161,10 +161,16 @@ class ZenohWire:
         """See `tfbus.links.wire.Wire`. A thread of the wire does what takes time, because zenoh's calls block."""
         await anyio.sleep_forever()
 
-    def publish(self, channel: str, message: bytes) -> bool:
+    def is_heard(self, channel: str) -> bool:
+        """See `tfbus.links.wire.Wire`. It is true for a new channel, until the router has said who hears it."""
+        session = self._session
+        return session is not None and session.is_heard(channel)
+
+    def publish(self, channel: str, message: bytes) -> None:
         """See `tfbus.links.wire.Wire`."""
         session = self._session
-        return session is not None and session.publish(channel, message)
+        if session is not None:
+            session.publish(channel, message)
 
     def send(self, link: str, message: bytes) -> bool:
         """See `tfbus.links.wire.Wire`. It is false while no router is connected, and goes in the order of all."""
@@ -296,14 +302,18 @@ class _Session:
         self._publishers[channel] = publisher, monotonic()
         return self._publishers[channel]
 
-    def publish(self, channel: str, message: bytes) -> bool:
+    def is_heard(self, channel: str) -> bool:
         try:
             publisher, since = self._publishers.get(channel) or self.declare(channel)
-            publisher.put(message)
             return bool(publisher.matching_status.matching) or monotonic() < since + SETTLED  # type: ignore[attr-defined]
         except zenoh.ZError:
             # The session has just ended.
             return False
+
+    def publish(self, channel: str, message: bytes) -> None:
+        with suppress(zenoh.ZError):
+            publisher, _ = self._publishers.get(channel) or self.declare(channel)
+            publisher.put(message)
 
     def send(self, key: str, message: bytes) -> bool:
         try:
@@ -415,49 +425,10 @@ def _content(sample: zenoh.Sample) -> bytes | MalformedMessageError:
 # Names in keys
 
 
-def check_domain(domain: str) -> str:
-    """Return a domain.
-
-    Raises
-    ------
-    ValueError
-        If it cannot be part of a key.
-    """
-    if len(domain) > LONGEST_NAME or not re.fullmatch(rf"{_NAME.pattern}(/{_NAME.pattern})*", domain, re.ASCII):
-        raise ValueError(
-            "a domain is made of letters, digits, '-', '_' and '.', with '/' between them, "
-            f"{LONGEST_NAME} at most, not {domain!r}"
-        )
-    return domain
-
-
-def check_robot(robot: str) -> str:
-    """Return the name of a robot.
-
-    Raises
-    ------
-    ValueError
-        If it cannot be part of a key.
-    """
-    if len(robot) > LONGEST_NAME or not _NAME.fullmatch(robot):
-        raise ValueError(
-            f"a robot's name is made of letters, digits, '-', '_' and '.', {LONGEST_NAME} at most, not {robot!r}"
-        )
-    return robot
-
-
 def robots_expression(robots: str) -> str:
-    """The key expression for the robots of a pattern, in which ``*`` stands for any letters.
-
-    Raises
-    ------
-    ValueError
-        If no name of a robot can match it.
-    """
+    """The key expression for the robots of a pattern, in which ``*`` stands for any letters."""
     if not robots:
         return NO_ROBOT
-    if len(robots) > LONGEST_NAME or not re.fullmatch(r"[\w.*-]+", robots, re.ASCII):
-        raise ValueError(f"the name of a robot, or a pattern such as 'r*', is needed, not {robots!r}")
     collapsed = re.sub(r"\*+", "*", robots)
     return collapsed if collapsed == "*" else collapsed.replace("*", "$*")
 

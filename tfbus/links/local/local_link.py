@@ -1,0 +1,57 @@
+"""`LocalLink`: joins a bus to the buses of other processes on this machine."""
+
+from typing import Unpack
+
+from tfbus.bus.bus import Bus
+from tfbus.links.link import DomainLink, DomainOptions
+from tfbus.links.local.local_wire import LocalWire
+
+
+class LocalLink(DomainLink):
+    """Joins a bus to the buses of the user's other processes on this machine: ``async with LocalLink(bus)``.
+
+    Nothing has to be configured or started, and no port is opened: each two links have a socket in a directory that
+    only the user can enter. For other machines there is `tfbus.links.zenoh.ZenohLink`; a bus may have both, and passes
+    on by each what comes by the other.
+
+    Parameters
+    ----------
+    bus : Bus
+    domain : str
+        Links hear each other if they have the same one.
+    directory : str, optional
+        The directory in which links meet, by default that of ``TFBUS_RUNTIME_DIR``, or else ``tfbus`` in
+        ``XDG_RUNTIME_DIR``, or else ``tfbus-UID`` in the directory for temporary files.
+    loopback : bool, optional
+        Use ports of the loopback, with a key in the directory, in place of Unix sockets. By default only where there
+        are none, as on Windows; all links of a domain have to use the same.
+    **options
+        Those of `tfbus.links.DomainLink`: `robot`, `robots`, `slow_rate`, `frames`, `drop_lost`, `max_frames`,
+        `capacity`, `history`, `clock` and `tell_clock`.
+
+    Raises
+    ------
+    ValueError, TypeError
+        As for `DomainLink`.
+    PermissionError
+        On entering, if others can enter the directory.
+    OSError, BusClosedError, RuntimeError
+        On entering, as for `DomainLink`.
+
+    Notes
+    -----
+    A peer is lost when its process or its link has ended, which the kernel tells at once. A process that is busy or
+    stopped is not lost; its frames grow old.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        domain: str = "tf",
+        *,
+        directory: str | None = None,
+        loopback: bool | None = None,
+        **options: Unpack[DomainOptions],
+    ) -> None:
+        wire = LocalWire(domain, options.get("robot") or "", directory=directory, loopback=loopback)
+        super().__init__(bus, domain, wire, **options)
