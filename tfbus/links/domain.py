@@ -28,7 +28,7 @@ from tfbus.links.message import (
     write_message,
     write_text,
 )
-from tfbus.links.outbox import Outbox, OutgoingBatch, RemovedFrame, Turn
+from tfbus.links.outbox import Outbox, OutgoingBatch, Rank, RemovedFrame, Turn
 from tfbus.links.peers import Peer
 from tfbus.links.relay import Provenance, ReceivedBatch, ReceivedTransform
 from tfbus.links.replica import CHUNK, Agreement, Claim, Entry, Replica, TooManyEntriesError
@@ -62,7 +62,7 @@ class DomainOutbox(Outbox):
         super().__init__(end.frames, end._notify)
         self._end = end
 
-    def own_sample(self, frame: str) -> TransformStamped | None:
+    def own_sample(self, frame: str, /) -> TransformStamped | None:
         entry = self._end.own.entries.get(frame)
         return None if entry is None or entry.origin != self._end.relay.origin else entry.sample
 
@@ -87,9 +87,9 @@ class DomainOutbox(Outbox):
             self.keep(batch)
         return False
 
-    def _follow_removal(self, removal: RemovedFrame, echo: bool, withdrawn: bool) -> bool:
-        if not echo and not withdrawn:
-            self._end.own.note(removal.frame, (removal.sequence, removal.origin), None, ours=True)
+    def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
+        if rank is not None:
+            self._end.own.note(frame, rank, None, ours=True)
         return False
 
 
@@ -185,14 +185,13 @@ class DomainEnd(Endpoint):
         now = self._now()
         question = self._agreement.question(now)
         if question is not None:
-            frames = sorted(self.frames) if self.frames is not None and self._filters else None if not
-            self._wire.send(question.peer, write_text(Kind.QUESTION, {"since": question.since, "frames": frames})):
+            frames = sorted(self.frames) if self.frames is not None and self._filters else None
+            text = write_text(Kind.QUESTION, {"since": question.since, "frames": frames})
+            if not self._wire.send(question.peer, text):
                 self._agreement.unanswered(question.peer, now)
         if now >= self._signed_at + self._sign_period:
             peers = len(self.peers.present)
-            self._sign_period = min(
-                2 * self._sign_period, max(LONGEST_SIGN_PERIOD, LONGEST_SIGN_PERIOD_EACH * peers)
-            )
+            self._sign_period = min(2 * self._sign_period, max(LONGEST_SIGN_PERIOD, LONGEST_SIGN_PERIOD_EACH * peers))
             self._sign(now)
         if self._history is not None:
             for peer in self._history.overdue():
@@ -521,11 +520,12 @@ class DomainEnd(Endpoint):
 
     def _show(self, peer: Peer, buses: Collection[bytes]) -> None:
         """Publish what the copies hold of buses to which a way leads again."""
-        batches: list[tuple[Provenance, list[ReceivedTransform]]] = []
-        for replica in self._replicas.values() if buses else ():
-            for entry in replica.entries.values():
-                if entry.origin in buses and isinstance(entry.sample, ReceivedTransform):
-                    batches.append((Provenance(entry.origin, entry.number, self.outbox, peer), [entry.sample]))
+        batches = [
+            (Provenance(entry.origin, entry.number, self.outbox, peer), [entry.sample])
+            for replica in (self._replicas.values() if buses else ())
+            for entry in replica.entries.values()
+            if entry.origin in buses and isinstance(entry.sample, ReceivedTransform)
+        ]
         self._publish(peer, batches, live=False)
 
     # Answers

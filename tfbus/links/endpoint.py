@@ -1,4 +1,4 @@
-"""One end of a link without its event loop: it publishes on the bus what peers have sent, within limits, and tells of it.
+"""One end of a link without its event loop: it publishes what peers have sent, within limits, and tells of them.
 
 `ForeignEnd` is the end of a link to another world, over a carrier; `tfbus.links.domain.DomainEnd` that of a link of
 tfbus, over a wire. Nothing that a peer sends makes either of them raise.

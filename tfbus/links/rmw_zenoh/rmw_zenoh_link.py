@@ -209,7 +209,7 @@ class RmwZenohCarrier(RosCarrier):
         )
 
     def _directly(self, take: Callable[[zenoh.Sample], None]) -> Any:
-        """Have a callback called in zenoh's thread; what it raises is received as a refusal, for zenoh would print it."""
+        """A callback for zenoh's threads; what `take` raises is received as a refusal, for zenoh would print it."""
 
         def call(sample: zenoh.Sample) -> None:
             try:
