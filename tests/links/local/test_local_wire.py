@@ -175,8 +175,8 @@ async def test_frames_that_come_in_pieces_are_put_together(directory: str) -> No
 @pytest.mark.every_loop
 async def test_no_frame_tears_where_the_socket_has_little_room(directory: str, loopback: bool) -> None:
     random = Random(2)
-    published = [b"p" + random.randbytes(random.choice([10, 3_000, 70_000, 300_000])) for _ in range(60)]
-    sent = [b"s" + random.randbytes(random.choice([10, 3_000, 70_000])) for _ in range(30)]
+    published = [b"p" + random.randbytes(random.choice([10, 3_000, 70_000, 150_000])) for _ in range(40)]
+    sent = [b"s" + random.randbytes(random.choice([10, 3_000, 70_000])) for _ in range(20)]
     async with raw_peer(directory, loopback=loopback, receive_buffer=4_096) as (wire, _, peer):
         heard: list[bytes] = []
 
@@ -190,7 +190,7 @@ async def test_no_frame_tears_where_the_socket_has_little_room(directory: str, l
 
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(say)
-            while sum(message[:1] == b"s" for message in heard) < len(sent) or heard[-1] != published[-1]:
+            while sum(message[:1] == b"s" for message in heard) < len(sent) or published[-1] not in heard:
                 heard.append(await peer.hear())
         assert [message for message in heard if message[:1] == b"s"] == sent
         rest = [message for message in heard if message[:1] == b"p"]
@@ -291,8 +291,8 @@ async def test_a_link_that_floods_leaves_other_tasks_their_turns(directory: str)
             peer = await RawPeer.connect(files_in(directory)[0], DOMAIN)
             async with peer.stream:
                 await peer.meet()
-                tasks.start_soon(peer.say, *[b"1"] * 1_000)
-                while total < 1_000:
+                tasks.start_soon(peer.say, *[b"1"] * 300)
+                while total < 300:
                     await anyio.lowlevel.checkpoint()
                     since_turn = 0
             tasks.cancel_scope.cancel()
