@@ -38,6 +38,8 @@ class LoopWaker:
     def __init__(self, callback: Callable[[], object]) -> None:
         self._callback = callback
         self._call_soon: Callable[[Callable[[], object]], object] | None = None
+        self._call_soon_here: Callable[[Callable[[], object]], object] | None = None
+        self._thread = 0
         self._loop_is_closed: Callable[[], bool] = _never
         self._requested = False
 
@@ -51,6 +53,9 @@ class LoopWaker:
         # anyio has no public function for this; only the loops' own functions wake them from a thread.
         native = cast(Any, anyio.lowlevel.current_token().native_token)
         self._call_soon = getattr(native, "run_sync_soon", None) or native.call_soon_threadsafe
+        # On the loop's own thread, asyncio needs no byte through its socket pair to wake up.
+        self._call_soon_here = getattr(native, "call_soon", self._call_soon)
+        self._thread = threading.get_ident()
         # trio answers each request that it has accepted. An asyncio loop may be closed with requests left.
         self._loop_is_closed = getattr(native, "is_closed", _never)
         # An earlier loop may have ended without answering a request.
@@ -64,12 +69,13 @@ class LoopWaker:
         RuntimeError
             If the event loop has ended, or `bind` was never called.
         """
-        if self._call_soon is None:
+        if self._call_soon is None or self._call_soon_here is None:
             raise RuntimeError("bind the waker on the event loop first")
         if not self._requested:
             self._requested = True
+            call_soon = self._call_soon_here if threading.get_ident() == self._thread else self._call_soon
             try:
-                self._call_soon(self._call)
+                call_soon(self._call)
             except BaseException:
                 self._requested = False
                 raise
