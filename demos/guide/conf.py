@@ -91,7 +91,15 @@ numpydoc_show_class_members = False
 default_role = "py:obj"
 
 # The import paths of which the reference tells, the preferred one first. Modules may move below them.
-PATHS = ("tfbus", "tfbus.links", "tfbus.links.zenoh", "tfbus.recording", "tfbus.analysis", "tfbus.testing", "tfbus.data")
+PATHS = (
+    "tfbus",
+    "tfbus.links",
+    "tfbus.links.zenoh",
+    "tfbus.recording",
+    "tfbus.analysis",
+    "tfbus.testing",
+    "tfbus.data",
+)
 
 
 def public_names() -> dict[int, str]:
