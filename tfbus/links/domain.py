@@ -296,7 +296,7 @@ class DomainEnd(Endpoint):
             self.lookups.answered(sender, text.data)
         else:
             fields = read_fields(text.data)
-            # What is told must not overtake a batch that has gathered.
+            # An answer must not overtake a batch that has gathered.
             self.send()
             if text.kind is Kind.QUESTION:
                 self._answer(sender, fields)

@@ -201,7 +201,7 @@ class Link:
             self.bus._entered.discard(self)
             await self._end.close()
 
-    # What an end needs of the event loop
+    # For the end: the event loop
 
     def receive(self, item: Received) -> None:
         """Have an item handled on the event loop; for any thread. Called by the end and its network."""
