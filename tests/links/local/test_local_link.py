@@ -1,4 +1,4 @@
-"""What a user of `LocalLink` is promised beyond what all links of tfbus have in common."""
+"""`LocalLink` at the door: its promises beyond those that the tests of the wire hold."""
 
 import pytest
 from support.processes import new_domain, until
