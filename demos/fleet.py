@@ -29,7 +29,6 @@ from tfbus.tf_message import encode
 DOMAIN = "fleet"
 IN_FULL = 10
 CONNECTING = 5
-CLIENT: dict[str, Any] = {"mode": "client"}
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ async def drive(fleet: Fleet, number: int, connecting: anyio.Semaphore) -> None:
     name = f"r{number}"
     async with AsyncExitStack() as stack:
         bus = stack.enter_context(tfbus.Bus())
-        link = ZenohLink(bus, DOMAIN, robot=name, robots=[], connect=fleet.address, config=CLIENT)
+        link = ZenohLink(bus, DOMAIN, robot=name, robots=[], connect=fleet.address)
         async with connecting:
             await stack.enter_async_context(link)
         broadcaster = tfbus.TransformBroadcaster(bus, authority=name)
@@ -89,7 +88,7 @@ async def look(fleet: Fleet, robots: Any, seconds: float, router_cpu: Any) -> di
             if not sizes:
                 sizes.append(len(encode(batch)) / len(batch))
 
-        link = ZenohLink(bus, DOMAIN, robots=robots, connect=fleet.address, config=CLIENT)
+        link = ZenohLink(bus, DOMAIN, robots=robots, connect=fleet.address)
         await stack.enter_async_context(link)
         await anyio.sleep(2.0)
         registration = stack.enter_context(bus.subscribe(note))
@@ -157,7 +156,7 @@ def main(robots: int, frames: int, rate: float, processes: int, seconds: float) 
 
 async def meet_all(fleet: Fleet) -> None:
     with tfbus.Bus() as bus:
-        async with ZenohLink(bus, DOMAIN, robots={"r*": 0.001}, connect=fleet.address, config=CLIENT) as link:
+        async with ZenohLink(bus, DOMAIN, robots={"r*": 0.001}, connect=fleet.address) as link:
             with bus.events() as events:
                 while len(link.peers) < fleet.robots:
                     await anext(events)

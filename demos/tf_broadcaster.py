@@ -10,7 +10,6 @@ import sys
 import anyio
 
 import tfbus
-from tfbus.links.zenoh import ZenohLink
 
 
 async def main(domain: str) -> None:
@@ -19,7 +18,7 @@ async def main(domain: str) -> None:
         broadcaster = tfbus.TransformBroadcaster(bus, authority="robot_tf_publisher", invalid="drop")
         # The laser is mounted 0.1 m forward of the robot's base, and 0.2 m above it.
         base_from_laser = tfbus.Transform(translation=(0.1, 0.0, 0.2))
-        async with ZenohLink(bus, domain):
+        async with tfbus.LocalLink(bus, domain):
             async for _ in bus.clock.ticks(100.0):
                 broadcaster.send("base_link", "base_laser", base_from_laser)
 

@@ -9,7 +9,6 @@ import sys
 import anyio
 
 import tfbus
-from tfbus.links.zenoh import ZenohLink
 
 
 async def listen(buffer: tfbus.Buffer) -> None:
@@ -45,7 +44,7 @@ def now(clock: tfbus.Clock) -> str:
 
 async def main(domain: str) -> None:
     with tfbus.Bus() as bus, tfbus.Buffer(bus) as buffer:
-        async with ZenohLink(bus, domain):
+        async with tfbus.LocalLink(bus, domain):
             await listen(buffer)
 
 

@@ -124,9 +124,9 @@ class LinkStatistics(PlainData):
     peers : int
         Connected peers now.
     sent_messages, sent_samples : int
-        Messages and samples that were sent as they were published. The static frames that are kept for late joiners
-        are not counted again, and over zenoh nothing is sent while nobody is there to hear it. What goes to peers that
-        hear only some frames is counted once for each set of frames.
+        Messages and samples that were sent as they were published. Answers to peers that have missed something are not
+        counted again, and links of tfbus send nothing while nobody is there to hear it. Samples for peers that hear
+        only some frames are counted once for each set of frames.
     received_messages, received_samples : int
         Messages and samples that were received and published on the bus.
     lost : int

@@ -59,7 +59,8 @@ nitpick_ignore_regex = [
     # The parts of a recording for code that reads it in blocks.
     ("py:class", r"tfbus\.recording\.(recording\.(Decoded)?Block|formats\.\w+\.RawTransform)"),
     # The parts of a link, and a follower of the time that is no clock.
-    ("py:class", r"tfbus\.links\.(_clock_follower\.HearsTime|ros\.\w+\.(RosCarrier|RosOptions))"),
+    ("py:class", r"tfbus\.links\.(clock_follower\.HearsTime|endpoint\.Endpoint|wire\.Wire|lookups\.Serving)"),
+    ("py:class", r"tfbus\.links\.(link\.DomainOptions|ros\.\w+\.(RosCarrier|RosOptions))"),
     # Sphinx splits the parameters of such types.
     ("py:class", r"[\w.]+\[\w+"),
 ]
@@ -79,6 +80,8 @@ autodoc_default_options = {
     "members": True,
     # What Python's own classes have is not told again.
     "inherited-members": "BaseException, Enum, tuple, object",
+    # The parts of a link call these.
+    "exclude-members": "receive, send_soon, stir, serve, lookups",
     "member-order": "bysource",
 }
 autodoc_typehints_format = "short"
@@ -88,7 +91,15 @@ numpydoc_show_class_members = False
 default_role = "py:obj"
 
 # The import paths of which the reference tells, the preferred one first. Modules may move below them.
-PATHS = ("tfbus", "tfbus.links.zenoh", "tfbus.recording", "tfbus.analysis", "tfbus.testing", "tfbus.data")
+PATHS = (
+    "tfbus",
+    "tfbus.links",
+    "tfbus.links.zenoh",
+    "tfbus.recording",
+    "tfbus.analysis",
+    "tfbus.testing",
+    "tfbus.data",
+)
 
 
 def public_names() -> dict[int, str]:

@@ -18,16 +18,21 @@ pytest.importorskip("cbor2", reason="the servers of all extras are looked at")
 pytest.importorskip("cyclopts", reason="the servers of all extras are looked at")
 
 import httpx
-from support.processes import free_ports, new_domain
+from anyio import create_task_group
+from support.processes import free_address, free_ports, new_domain, until
 from support.rosbridge import rosbridge_server
 
-from tfbus import Buffer, Bus
+from tfbus import Buffer, Bus, LocalLink, RemoteLookupError, Transform, TransformBroadcaster
 from tfbus.cli.commands.router import router
+from tfbus.links import BufferServer
 from tfbus.links.dds import DdsLink
 from tfbus.links.foxglove import FoxgloveServer
+from tfbus.links.local.local_wire import LocalWire
+from tfbus.links.message import Kind, write_body
 from tfbus.links.rmw_zenoh import RmwZenohLink
 from tfbus.links.rosbridge import RosbridgeLink
-from tfbus.links.zenoh import BufferServer, ZenohLink, ZenohRouter
+from tfbus.links.zenoh import ZenohLink, ZenohRouter
+from tfbus.links.zenoh.addresses import client_config, open_session
 from tfbus.view import View
 
 ROOT = Path(__file__).parents[2]
@@ -69,8 +74,6 @@ Made = Callable[[Bus, Buffer], AbstractAsyncContextManager[Any]]
 SERVERS: dict[str, Made] = {
     "View": lambda bus, buffer: View(bus, buffer, 0),
     "FoxgloveServer": lambda bus, _: FoxgloveServer(bus, 0),
-    "ZenohLink": lambda bus, _: ZenohLink(bus, new_domain()),
-    "BufferServer": lambda _, buffer: BufferServer(buffer, new_domain()),
 }
 
 
@@ -89,20 +92,108 @@ on_linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells 
 
 @pytest.mark.anyio
 @on_linux
-@pytest.mark.parametrize("name", [*SERVERS, "RosbridgeLink", "RmwZenohLink"])
+@pytest.mark.parametrize("name", SERVERS)
 async def test_by_default_only_this_machine_reaches(name: str) -> None:
     with Bus() as bus, Buffer(bus) as buffer:
-        if name == "RosbridgeLink":
+        opened = await opened_by(SERVERS[name](bus, buffer))
+    assert opened
+    assert all(map(is_of_this_machine, opened)), opened
+
+
+@pytest.mark.anyio
+@on_linux
+@pytest.mark.parametrize("name", ["LocalLink", "ZenohLink", "BufferServer", "RosbridgeLink", "RmwZenohLink"])
+async def test_a_link_that_connects_listens_nowhere(name: str) -> None:
+    address = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    with Bus() as bus, Buffer(bus) as buffer:
+        if name == "LocalLink":
+            opened = await opened_by(LocalLink(bus, new_domain()))
+        elif name == "BufferServer":
+            async with LocalLink(bus, new_domain()) as link:
+                opened = await opened_by(BufferServer(buffer, link))
+        elif name == "RosbridgeLink":
             async with rosbridge_server() as server:
-                assert await opened_by(RosbridgeLink(bus, server.url)) == set()
-        elif name == "RmwZenohLink":
-            address = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-            async with ZenohRouter(address):
-                assert await opened_by(RmwZenohLink(bus, address, 87)) == set()
+                opened = await opened_by(RosbridgeLink(bus, server.url))
         else:
-            opened = await opened_by(SERVERS[name](bus, buffer))
-            assert opened
-            assert all(map(is_of_this_machine, opened)), opened
+            made = (
+                ZenohLink(bus, new_domain(), connect=address) if name == "ZenohLink" else RmwZenohLink(bus, address, 87)
+            )
+            async with ZenohRouter(address):
+                opened = await opened_by(made)
+    assert opened == set()
+
+
+@pytest.mark.anyio
+async def test_a_peer_of_a_link_cannot_fill_the_bus() -> None:
+    domain = new_domain()
+    with Bus() as bus, Buffer(bus) as buffer, Bus() as stranger:
+        async with LocalLink(bus, domain, max_frames=3) as link, LocalLink(stranger, domain):
+            for number in range(10):
+                TransformBroadcaster(stranger).send_static("map", f"frame {number}", Transform())
+            await until(lambda: link.statistics().rejected.get("too many frames", 0) >= 7)
+            assert len(buffer.tree.frames()) == 4
+
+
+@pytest.mark.anyio
+async def test_a_buffer_server_takes_no_more_lookups_than_may_wait_and_garbage_harms_nobody() -> None:
+    domain = new_domain()
+    stranger = LocalWire(domain)
+    with Bus() as bus, Buffer(bus) as buffer, Bus() as other:
+        async with LocalLink(bus, domain) as link, LocalLink(other, domain) as asker, create_task_group() as tasks:
+            await stranger.open([], lambda *_: None, print)
+            tasks.start_soon(stranger.run)
+            async with BufferServer(buffer, link, capacity=2) as server:
+
+                async def ask(frame: str) -> None:
+                    with suppress(RemoteLookupError):
+                        await asker.lookup("map", frame, timeout=60.0)
+
+                for number in range(3):
+                    tasks.start_soon(ask, f"frame {number}")
+                await until(lambda: server.statistics().refused == {"busy": 1})
+                for garbage in (b"{", b"[" * 10_000, b'{"target": 1}', b"\xff" * 99):
+                    await until(lambda said=garbage: stranger.send(link.id, write_body(Kind.LOOKUP, bytes(8) + said)))  # type: ignore[misc]
+                await until(lambda: server.statistics().refused == {"busy": 1, "malformed": 4})
+                TransformBroadcaster(bus).send_static("map", "dock", Transform((4.0, 1.0, 0.0)))
+                found = await asker.lookup("map", "dock", timeout=5.0)
+                assert found.transform.translation == (4.0, 1.0, 0.0)
+                tasks.cancel_scope.cancel()
+    await stranger.close()
+
+
+@pytest.mark.anyio
+async def test_a_guest_that_may_not_publish_cannot_speak_for_another_link(tmp_path: Path) -> None:
+    domain, at_guests, at_friends = new_domain(), free_address(), f"unixsock-stream/{tmp_path}/router"
+    rule = {
+        "id": "publishing",
+        "messages": ["put", "delete"],
+        "flows": ["ingress"],
+        "permission": "deny",
+        "key_exprs": ["tfbus/**", "tfbus/**/@to/*"],
+    }
+    rules = {
+        "enabled": True,
+        "default_permission": "allow",
+        "rules": [rule],
+        "subjects": [{"id": "guests", "link_protocols": ["tcp"]}],
+        "policies": [{"rules": ["publishing"], "subjects": ["guests"]}],
+    }
+    with Bus() as bus, Bus() as guest, Buffer(guest) as buffer:
+        async with (
+            ZenohRouter([at_guests, at_friends], config={"access_control": rules}),
+            ZenohLink(bus, domain, connect=at_friends) as robot,
+            ZenohLink(Bus(), domain, connect=at_friends) as friend,
+            ZenohLink(guest, domain, connect=at_guests),
+        ):
+            await until(lambda: friend.id in robot.peers)
+            TransformBroadcaster(bus).send_static("base_link", "laser", Transform())
+            await until(lambda: "laser" in buffer.tree.frames())
+            for address in (at_guests, at_friends):
+                session = open_session(client_config(address, None, None))
+                session.put(f"tfbus/{domain}/@to/{robot.id}", b"noise", attachment=bytes.fromhex(friend.id))
+                session.close()
+            await until(lambda: robot.statistics().rejected != {})
+            assert robot.statistics().rejected == {"version": 1}
 
 
 @pytest.mark.anyio

@@ -277,12 +277,14 @@ class DomainEnd(Endpoint):
         if isinstance(content, Joined):
             peer = self._join(sender, content.robot)
             if peer is not None:
-                # A peer hears of a filter by the first question.
-                self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
                 self._meet(peer)
                 self._sign_sooner()
-                if self._history is not None:
-                    self._history.joined(sender)
+                # Nothing is wanted of a robot of rate 0 but answers to lookups.
+                if self._rate_of(peer.robot):
+                    # A peer hears of a filter by the first question.
+                    self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
+                    if self._history is not None:
+                        self._history.joined(sender)
                 self.host.stir()
         elif isinstance(content, Text):
             self._take_text(sender, content)
@@ -296,7 +298,7 @@ class DomainEnd(Endpoint):
             self.lookups.answered(sender, text.data)
         else:
             fields = read_fields(text.data)
-            # What is told must not overtake a batch that has gathered.
+            # An answer must not overtake a batch that has gathered.
             self.send()
             if text.kind is Kind.QUESTION:
                 self._answer(sender, fields)
@@ -315,6 +317,8 @@ class DomainEnd(Endpoint):
             self._update_ways(peer, heard)
             if heard.kind in (Kind.SIGN, Kind.MEETING):
                 self.lookups.note_server(sender, peer.robot, heard.serves)
+                if not self._rate_of(peer.robot):
+                    return
             if heard.kind is not Kind.SIGN:
                 self.messages += 1
         if heard.kind is Kind.LIVE and self._history is not None and self._history.holds(sender, heard):

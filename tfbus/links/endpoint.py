@@ -22,7 +22,7 @@ from tfbus.tf_message import MalformedMessageError
 
 
 class Host(Protocol):
-    """What an end needs of the event loop, and of the link that has one."""
+    """The event loop and the link, as an end needs them."""
 
     def receive(self, item: Received) -> None:
         """Have an item handled on the event loop; for any thread."""

@@ -201,7 +201,7 @@ class Link:
             self.bus._entered.discard(self)
             await self._end.close()
 
-    # What an end needs of the event loop
+    # For the end: the event loop
 
     def receive(self, item: Received) -> None:
         """Have an item handled on the event loop; for any thread. Called by the end and its network."""
@@ -345,8 +345,8 @@ class DomainLink(Link):
     Notes
     -----
     Nothing here blocks the event loop: while the network is congested, live messages are dropped, which the other end
-    counts as `lost`. Static frames, removals and the newest sample of each moving frame are recovered, see
-    `tfbus.links.replica`. Whoever can reach the link can publish and remove any frame.
+    counts as `lost`. Static frames, removals and the newest sample of each moving frame are recovered, as the guide's
+    page on the protocol of links tells. A program that can reach the link can publish and remove any frame.
     """
 
     def __init__(

@@ -96,7 +96,7 @@ class RemoteLookups:
         self._is_open = False
         self.server: Answers | None = None
 
-    # What comes
+    # Coming in
 
     def open(self) -> None:
         """The link is there."""
@@ -150,7 +150,7 @@ class RemoteLookups:
         """An answer that refuses a question."""
         return write_answer(self._error(None, reason, detail))
 
-    # What is asked
+    # Going out
 
     async def ask(self, question: RemoteQuestion, robot: str | None, limit: float) -> TransformStamped:
         """Ask a link of a robot that serves a buffer, until there is an answer; the errors are those of `lookup`."""

@@ -68,7 +68,7 @@ Way = tuple[bytes, tuple[bytes, ...]]
 
 
 class Kind(enum.IntEnum):
-    """What a message is for."""
+    """The purpose of a message."""
 
     LIVE = 1
     SIGN = 2
@@ -86,7 +86,7 @@ TEXTS = frozenset({Kind.QUESTION, Kind.PAST_QUESTION, Kind.LOOKUP, Kind.LOOKUP_A
 
 @dataclass(frozen=True, slots=True)
 class Outgoing:
-    """What goes out with the entries of a message.
+    """The rest of a message, beside its entries.
 
     Attributes
     ----------
@@ -188,7 +188,7 @@ def can_hold(sample: TransformStamped) -> bool:
 
 
 def reason_not_to_send(sample: TransformStamped) -> InvalidTransformError | None:
-    """Why a sample cannot be in a message; None if it can."""
+    """The reason that keeps a sample out of a message; None if there is none."""
     try:
         size = len(sample.authority.encode())
     except UnicodeEncodeError:
@@ -203,7 +203,7 @@ def reason_not_to_send(sample: TransformStamped) -> InvalidTransformError | None
 
 
 def size_of(entry: Entry) -> int:
-    """How many samples and removals an entry is."""
+    """The number of samples and removals in an entry."""
     return len(entry.samples) if type(entry) is OutgoingBatch else 1
 
 

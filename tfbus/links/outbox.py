@@ -1,4 +1,4 @@
-"""What a link has to send: batches and removals gather in its outbox until the turn of the event loop ends."""
+"""The outbox of a link, in which batches and removals gather until the turn of the event loop ends."""
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass

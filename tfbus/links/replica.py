@@ -81,7 +81,7 @@ _NEVER = -inf
 
 
 class Entry(NamedTuple):
-    """What a copy holds of one frame.
+    """The newest that was said of one frame.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Entry(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """What a sign or an answer says of the sender's copy.
+    """The state of the sender's copy, in a sign or an answer.
 
     Attributes
     ----------
@@ -324,7 +324,7 @@ def _told(frame: str, entry: Entry) -> OutgoingBatch | RemovedFrame:
 
 
 class _Copy:
-    """What is known of the copy of one peer."""
+    """The copy of one peer, as far as it is known."""
 
     __slots__ = ("claim", "due", "fruitless", "missed", "replica", "seen", "silences")
 

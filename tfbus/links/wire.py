@@ -1,6 +1,6 @@
 """The seam below a link of tfbus: a wire moves bytes between the links of one domain, and says which links are there.
 
-A link of tfbus decides what is said, to whom and when, and what is news (`tfbus.links.domain_link`). Its wire knows one
+A link of tfbus decides what is said, to whom and when, and what is news (`tfbus.links.domain`). Its wire knows one
 network. A new network is one class with these methods. Links to other worlds, such as ROS, have messages of that world
 and sit on `tfbus.links.carrier` instead.
 """
@@ -44,7 +44,7 @@ class Left:
 
 
 WireItem = bytes | Joined | Left | MalformedMessageError
-"""What a wire brings of one link; the error is for a message that the wire has refused."""
+"""An item that a wire brings of one link; the error is for a message that the wire has refused."""
 Receive = Callable[[str, WireItem], object]
 
 

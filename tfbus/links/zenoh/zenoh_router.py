@@ -24,14 +24,14 @@ class ZenohRouter:
     Parameters
     ----------
     listen : str or iterable of str
-        zenoh's endpoints; by default `ROUTER`.
+        zenoh's endpoints; by default ``tcp/127.0.0.1:17447``, which only this machine reaches.
     connect : str or iterable of str, optional
         The addresses of other routers.
     config : mapping of str to any, optional
         Settings of zenoh by their path: TLS, access control.
     lease : float, optional
         Seconds of silence after which the router is taken for lost, and so the time in which links notice that they are
-        cut off from it; by default `tfbus.links.zenoh.addresses.LEASE`.
+        cut off from it; 4 s by default.
 
     Raises
     ------
