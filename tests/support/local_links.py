@@ -13,7 +13,7 @@ from typing import Self
 import anyio
 import anyio.abc
 
-from tfbus.links.local import LocalWire
+from tfbus.links.local.local_wire import LocalWire
 from tfbus.links.wire import Hearing, Joined, Left, WireItem
 from tfbus.tf_message import MalformedMessageError
 

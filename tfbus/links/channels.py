@@ -96,11 +96,14 @@ class Channels:
         self.report: SendReport
 
     def serve(self, frames: frozenset[str], now: float) -> bool:
-        """Publish a filter from now on; returns False if there are too many."""
+        """Publish a filter from now on, in place of one that nobody hears if there are many; False if all are heard."""
         name = filter_name(frames)
         if name not in self._filters and name != ALL:
             if len(self._filters) >= MOST_FILTERS:
-                return False
+                unheard = next((each for each in self._filters if not self._wire.is_heard(each)), None)
+                if unheard is None:
+                    return False
+                del self._filters[unheard]
             self._filters[name] = _Channel(name, frames, now)
         return True
 

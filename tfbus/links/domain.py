@@ -5,7 +5,7 @@ from contextlib import nullcontext
 from fnmatch import fnmatchcase
 from math import inf
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
@@ -29,9 +29,9 @@ from tfbus.links.message import (
     write_text,
 )
 from tfbus.links.outbox import Outbox, OutgoingBatch, Rank, RemovedFrame, Turn
-from tfbus.links.peers import Peer
+from tfbus.links.peers import MAX_PEERS, Peer
 from tfbus.links.relay import Provenance, ReceivedBatch, ReceivedTransform
-from tfbus.links.replica import CHUNK, Agreement, Claim, Entry, Replica, TooManyEntriesError
+from tfbus.links.replica import CHUNK, Agreement, Claim, Entry, Places, Replica, TooManyEntriesError
 from tfbus.links.wire import Hearing, Joined, Left, Wire, WireItem
 from tfbus.tf_message import MalformedMessageError
 
@@ -43,6 +43,14 @@ LONGEST_SIGN_PERIOD_EACH = 0.1
 
 A sign goes to all peers, so a link with many of them signs less often: both times are at least so much for each peer.
 """
+SOONEST_SIGN = 0.05
+"""s; no two signs follow each other faster, whatever changes."""
+MOST_QUESTIONS = 1_000
+"""So many questions for changes or the past may wait for an answer, one of each kind of each link."""
+MOST_ROBOTS = 100
+"""So many robots are remembered of which no link is there."""
+MOST_WAITING = 10_000
+"""So many links wait until a place of a peer is free."""
 _LARGEST_GAP = 2**32
 _URGENT = frozenset(Kind) - {Kind.LIVE, Kind.SIGN}
 _FOLLOWS = frozenset({Kind.MEETING, Kind.ANSWER, Kind.PAST})
@@ -148,6 +156,7 @@ class DomainEnd(Endpoint):
         self.outbox = DomainOutbox(self)
         self._channels = Channels(wire, self.relay.origin, self.frames is not None)
         self._channels.report = self.report
+        self._places = Places(self.max_frames)
         self._replicas: dict[str, Replica] = {}
         self.own = self._replica_of(robot)
         self._agreement = Agreement()
@@ -156,7 +165,12 @@ class DomainEnd(Endpoint):
         self.lookups = RemoteLookups(wire.send, wire.id, name)
         self._news: dict[str, bool] = {}
         self._thinned: dict[str, float] = {}
+        # What is answered takes half of the time of the event loop at most.
+        self._questions: dict[tuple[str, Kind], bytes] = {}
+        self._answers_due = -inf
+        self._waiting: dict[str, Joined] = {}
         self._signed_at = -inf
+        self._hurries = False
         self._sign_period = SIGN_PERIOD
         self._slow_due = -inf
 
@@ -183,20 +197,25 @@ class DomainEnd(Endpoint):
 
     def work(self) -> float:
         now = self._now()
+        if self._questions and now >= self._answers_due:
+            (sender, kind) = next(iter(self._questions))
+            self.handle(sender, _Due(kind, self._questions.pop((sender, kind))))
+            after = self._now()
+            now, self._answers_due = after, 2 * after - now
         question = self._agreement.question(now)
         if question is not None:
             frames = sorted(self.frames) if self.frames is not None and self._filters else None
             text = write_text(Kind.QUESTION, {"since": question.since, "frames": frames})
             if not self._wire.send(question.peer, text):
                 self._agreement.unanswered(question.peer, now)
-        if now >= self._signed_at + self._sign_period:
+        if now >= self._sign_due:
             peers = len(self.peers.present)
             self._sign_period = min(2 * self._sign_period, max(LONGEST_SIGN_PERIOD, LONGEST_SIGN_PERIOD_EACH * peers))
             self._sign(now)
         if self._history is not None:
             for peer in self._history.overdue():
                 self._end_history(peer)
-        due = min(self._agreement.next_due(), self._signed_at + self._sign_period)
+        due = min(self._agreement.next_due(), self._sign_due, self._answers_due if self._questions else inf)
         if self._history is not None:
             due = min(due, self._history.next_due())
         if self._wire.is_heard(SLOW):
@@ -212,8 +231,8 @@ class DomainEnd(Endpoint):
     # For its parts
 
     def sign_soon(self) -> None:
-        """Sign in this turn of the event loop, or the next."""
-        self._signed_at = -inf
+        """Sign in the next turn of the event loop, or `SOONEST_SIGN` after the last sign."""
+        self._hurries = True
         self.host.stir()
 
     def serve(self, server: Answers | None) -> None:
@@ -238,8 +257,12 @@ class DomainEnd(Endpoint):
             self._sign_period = period
             self.host.stir()
 
+    @property
+    def _sign_due(self) -> float:
+        return self._signed_at + (SOONEST_SIGN if self._hurries else self._sign_period)
+
     def _sign(self, now: float) -> None:
-        self._signed_at = now
+        self._signed_at, self._hurries = now, False
         self.send()
         self._channels.sign(self.own, now, self._reach(), self._serves)
 
@@ -286,6 +309,10 @@ class DomainEnd(Endpoint):
                     if self._history is not None:
                         self._history.joined(sender)
                 self.host.stir()
+            elif self.peers.get(sender) is None and len(self._waiting) < MOST_WAITING:
+                self._waiting[sender] = content
+        elif isinstance(content, _Due):
+            self._answer_due(sender, content)
         elif isinstance(content, Text):
             self._take_text(sender, content)
         else:
@@ -297,13 +324,20 @@ class DomainEnd(Endpoint):
         elif text.kind is Kind.LOOKUP_ANSWER:
             self.lookups.answered(sender, text.data)
         else:
-            fields = read_fields(text.data)
-            # An answer must not overtake a batch that has gathered.
-            self.send()
-            if text.kind is Kind.QUESTION:
-                self._answer(sender, fields)
-            else:
-                self._tell_past(sender, fields)
+            key = sender, text.kind
+            if key not in self._questions and len(self._questions) >= MOST_QUESTIONS:
+                raise MalformedMessageError("too many questions", f"{MOST_QUESTIONS} wait for an answer")
+            self._questions[key] = text.data
+            self.host.stir()
+
+    def _answer_due(self, sender: str, question: "_Due") -> None:
+        fields = read_fields(question.data)
+        # An answer must not overtake a batch that has gathered.
+        self.send()
+        if question.kind is Kind.QUESTION:
+            self._answer(sender, fields)
+        else:
+            self._tell_past(sender, fields)
 
     def _take_message(self, sender: str, heard: Heard) -> None:
         peer = self.peers.get(sender)
@@ -478,6 +512,13 @@ class DomainEnd(Endpoint):
 
     # Presence
 
+    def _leave(self, sender: str) -> None:
+        self._waiting.pop(sender, None)
+        super()._leave(sender)
+        if self._waiting and len(self.peers) < MAX_PEERS:
+            link = next(iter(self._waiting))
+            self._take(link, self._waiting.pop(link))
+
     def _lose(self, peer: Peer) -> tuple[str, ...]:
         lost = self._forget(peer)
         frames = tuple(self.relay.frames_of(lost))
@@ -493,6 +534,7 @@ class DomainEnd(Endpoint):
         self.lookups.left(peer.id)
         self._news.pop(peer.id, None)
         self._thinned.pop(peer.id, None)
+        self._forget_robots(peer.robot)
         lost = {bus for bus in peer.paths if self.relay.way_closed(bus)}
         if peer.paths:
             self.relay.reach_changed(self.outbox)
@@ -607,8 +649,20 @@ class DomainEnd(Endpoint):
     def _replica_of(self, robot: str) -> Replica:
         replica = self._replicas.get(robot)
         if replica is None:
-            replica = self._replicas[robot] = Replica(self.max_frames, self.relay.origin)
+            replica = self._replicas[robot] = Replica(self.max_frames, self.relay.origin, self._places)
         return replica
+
+    def _forget_robots(self, gone: str) -> None:
+        """Forget the copies of the robots that have gone first, if many have gone."""
+        replica = self._replicas.get(gone)
+        if replica is None or len(self._replicas) <= MOST_ROBOTS:
+            return
+        # Those that have come or gone last are the last.
+        self._replicas[gone] = self._replicas.pop(gone)
+        here = {peer.robot for peer in self.peers} | {self._robot}
+        absent = [robot for robot in self._replicas if robot not in here]
+        for robot in absent[: max(len(absent) - MOST_ROBOTS, 0)]:
+            self._replicas.pop(robot).forget()
 
     def _hearings(self) -> list[Hearing]:
         channels = {inf: self._channel, 0.0: QUIET}
@@ -616,6 +670,13 @@ class DomainEnd(Endpoint):
 
     def _rate_of(self, robot: str) -> float:
         return next((rate for robots, rate in self._robots.items() if fnmatchcase(robot, robots)), inf)
+
+
+class _Due(NamedTuple):
+    """A question whose turn has come."""
+
+    kind: Kind
+    data: bytes
 
 
 def _moves(entry: Entry) -> bool:

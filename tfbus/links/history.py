@@ -27,6 +27,8 @@ LONGEST_HISTORY = 3_600.0
 """s."""
 MOST_HELD = 1_000
 """So many live messages of one peer wait for what it tells; then it is not asked for more."""
+MOST_HELD_SAMPLES = 100_000
+"""So many samples and removals wait in the messages of all peers together; further messages do not wait."""
 PATIENCE = 5.0
 """s; so long they wait for one answer."""
 MOST_REMEMBERED = 10_000
@@ -100,6 +102,7 @@ class _Open:
     due: float
     after: str = ""
     held: list[Heard] = field(default_factory=list)
+    size: int = 0
 
 
 class HistoryAsker:
@@ -120,6 +123,7 @@ class HistoryAsker:
         self._now = now
         self._asked: dict[str, None] = {}
         self._open: dict[str, _Open] = {}
+        self._size = 0
 
     def joined(self, peer: str) -> None:
         """Ask a peer, if it was not asked before."""
@@ -135,7 +139,12 @@ class HistoryAsker:
         waiting = self._open.get(peer)
         if waiting is None or len(waiting.held) >= MOST_HELD:
             return False
+        size = sum(1 + len(entry.samples) if isinstance(entry, ReceivedBatch) else 1 for entry in message.entries)
+        if self._size + size > MOST_HELD_SAMPLES:
+            return False
         waiting.held.append(message)
+        waiting.size += size
+        self._size += size
         return True
 
     def goes_on(self, peer: str, message: Heard) -> bool:
@@ -163,7 +172,10 @@ class HistoryAsker:
     def end(self, peer: str) -> list[Heard]:
         """Await no answer of a peer any more; returns what was held back."""
         waiting = self._open.pop(peer, None)
-        return [] if waiting is None else waiting.held
+        if waiting is None:
+            return []
+        self._size -= waiting.size
+        return waiting.held
 
     def overdue(self) -> list[str]:
         """The peers whose answers have not come in time."""

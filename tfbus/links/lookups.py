@@ -6,6 +6,7 @@ wants to know. One that is given up is cancelled there. What comes from stranger
 """
 
 import logging
+import os
 from collections import Counter
 from collections.abc import Callable
 from time import monotonic
@@ -32,6 +33,7 @@ from tfbus.links.remote_lookup import (
     write_question,
 )
 from tfbus.statistics import BufferServerStatistics
+from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.lookup import Hold
 
 LONGEST_WAIT = 10.0
@@ -88,7 +90,8 @@ class RemoteLookups:
         self._id = id
         self._domain = domain
         self._capacity = capacity
-        self._number = 0
+        # Drawn at random, so that nobody guesses the numbers of questions of others.
+        self._first = self._number = int.from_bytes(os.urandom(7), "little")
         self._pending: dict[int, _Pending] = {}
         # The peers that serve a buffer, and their robots.
         self._servers: dict[str, str] = {}
@@ -132,12 +135,24 @@ class RemoteLookups:
 
     def asked(self, asker: str, data: bytes) -> None:
         """Take a question of a link."""
-        if self.server is not None and len(data) > _NUMBER:
-            self.server.take(asker, int.from_bytes(data[:_NUMBER], "little"), data[_NUMBER:])
+        number = int.from_bytes(data[:_NUMBER], "little")
+        if self.server is None:
+            self.answer(asker, number, self.refusal("absent", "nobody offers it"))
+        elif len(data) > _NUMBER:
+            self.server.take(asker, number, data[_NUMBER:])
 
     def answered(self, peer: str, data: bytes) -> None:
-        """Take an answer of a link: its number, and what it says."""
-        pending = self._pending.get(int.from_bytes(data[:_NUMBER], "little"))
+        """Take an answer of a link: its number, and what it says.
+
+        Raises
+        ------
+        MalformedMessageError
+            If there was no such question; one that was given up is none of these.
+        """
+        number = int.from_bytes(data[:_NUMBER], "little")
+        if not self._first < number <= self._number:
+            raise MalformedMessageError("lookup", "an answer to a question that was never asked")
+        pending = self._pending.get(number)
         if pending is not None and pending.peer == peer and len(data) > _NUMBER:
             pending.answer = data[_NUMBER:]
             pending.done.set()

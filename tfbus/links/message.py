@@ -22,9 +22,10 @@ entry may cost more, so both have a limit.
 import enum
 import json
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, groupby, repeat
+from sys import intern
 from typing import Any, NamedTuple
 
 from tfbus.errors import InvalidTransformError
@@ -50,6 +51,7 @@ _LARGE = 2**15
 """Bytes; a message beyond is read in parts."""
 _PART = 200
 """So many samples, or entries, of a large message are decoded, or handled, before other tasks may have their turn."""
+_PART_OF_HEAD = 1_000
 _LONGEST_AUTHORITY = 65_535
 
 _HEADER = struct.Struct("<BBBBHHIQ16sQQQ")
@@ -302,7 +304,7 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
     if len(data) > MAX_BYTES:
         raise MalformedMessageError("oversized", f"{len(data)} bytes, more than {MAX_BYTES}")
     try:
-        heard, told, end = _read_head(kind, data)
+        heard, told, end = yield from _read_head(kind, data)
     except (struct.error, IndexError):
         detail = f"the head of a message of {len(data)} bytes is cut off or inconsistent"
         raise MalformedMessageError("head", detail) from None
@@ -364,12 +366,12 @@ def read_fields(data: bytes) -> dict[str, Any]:
     return fields
 
 
-def _read_head(kind: Kind, data: bytes) -> tuple[Heard, list[_Batch | RemovedFrame], int]:
+def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, list[_Batch | RemovedFrame], int]]:
     _, _, flags, ways, origin_count, authority_count, entry_count, number, bus, *claimed = _HEADER.unpack_from(data)
     if entry_count > MAX_ENTRIES:
         raise MalformedMessageError("oversized", f"a message of {entry_count} entries, more than {MAX_ENTRIES}")
     since, sequence, digest = claimed
-    if since > sequence:
+    if since > sequence or origin_count > entry_count or authority_count > MAX_SAMPLES:
         raise IndexError
     at, time = _HEADER.size, None
     if flags & _HAS_TIME:
@@ -389,17 +391,22 @@ def _read_head(kind: Kind, data: bytes) -> tuple[Heard, list[_Batch | RemovedFra
     for _ in range(authority_count):
         (length,) = _LENGTH.unpack_from(data, at)
         at += _LENGTH.size
-        authorities.append(data[at : at + length].decode())
+        # One string for all messages that name it: it may be long, and each sample keeps it.
+        authorities.append(intern(data[at : at + length].decode()))
         at += length
     entries: list[_Batch | RemovedFrame] = []
     # Each entry takes some bytes, so a false count ends the loop with an error before the list grows long.
-    for _ in range(entry_count):
+    run_count = 0
+    for index in range(entry_count):
+        if index % _PART_OF_HEAD == _PART_OF_HEAD - 1:
+            yield None
         entry_kind, origin, size, entry_number = _ENTRY.unpack_from(data, at)
         at += _ENTRY.size
         if entry_kind == _REMOVAL and size <= MAX_NAME:
             entries.append(RemovedFrame(origins[origin], entry_number, data[at : at + size].decode()))
             at += size
-        elif entry_kind == _BATCH:
+        elif entry_kind == _BATCH and size and run_count + size <= MAX_SAMPLES:
+            run_count += size
             runs = _RUN.iter_unpack(data[at : at + _RUN.size * size])
             at += _RUN.size * size
             named = tuple((authorities[authority], bool(static), count) for authority, static, count in runs)

@@ -7,6 +7,8 @@ from tfbus.bus.subscribers import SeenKeys
 
 MAX_PEERS = 1_000
 MAX_AUTHORITIES = 1_000
+MOST_AUTHORITY_TEXT = 2**20
+"""Letters of all authorities of one peer together."""
 _REMEMBERED_REASONS = 100
 
 
@@ -24,6 +26,8 @@ class Peer:
         That of its newest live message; 0 before the first.
     authorities : set of str
         The authorities whose samples it has sent.
+    authority_text : int
+        The letters of these.
     frames : set of str
         The frames that it was the first to bring from a world without origins; their number is limited.
     paths : dict of bytes to tuple of bytes
@@ -32,7 +36,7 @@ class Peer:
         The reasons of refusals that were reported.
     """
 
-    __slots__ = ("authorities", "frames", "id", "number", "paths", "present", "reported", "robot")
+    __slots__ = ("authorities", "authority_text", "frames", "id", "number", "paths", "present", "reported", "robot")
 
     def __init__(self, id: str) -> None:  # noqa: A002 - the wire calls it so
         self.id = id
@@ -40,6 +44,7 @@ class Peer:
         self.robot = ""
         self.number = 0
         self.authorities: set[str] = set()
+        self.authority_text = 0
         self.frames: set[str] = set()
         self.paths: dict[bytes, tuple[bytes, ...]] = {}
         self.reported = SeenKeys(_REMEMBERED_REASONS)
@@ -134,9 +139,13 @@ class Peers:
         """Note the authorities that a batch names; returns False, and refuses the batch, if they are too many."""
         for authority in authorities:
             if authority not in peer.authorities:
-                if len(peer.authorities) >= MAX_AUTHORITIES:
-                    error = ValueError(f"the peer has spoken for more than {MAX_AUTHORITIES} authorities")
+                text = peer.authority_text + len(authority)
+                if len(peer.authorities) >= MAX_AUTHORITIES or text > MOST_AUTHORITY_TEXT:
+                    error = ValueError(
+                        f"the peer has spoken for more than {MAX_AUTHORITIES} authorities, or for very long ones"
+                    )
                     self.reject(peer.id, "too many authorities", error, samples)
                     return False
                 peer.authorities.add(authority)
+                peer.authority_text = text
         return True

@@ -34,7 +34,7 @@ from tfbus.registration import Registration
 from tfbus.rows import Row
 
 LARGEST_JUMP = 2**52
-"""A number may be so far ahead of all that came before: 142 years in us, for some machines begin in 1970."""
+"""A number may be so far ahead of this machine's time: 142 years in us, for some machines begin in 1970."""
 MANY_PEERS = 20
 """All origins together may have so many times the frames that one of them may have."""
 MAX_ORIGINS = 10_000
@@ -140,6 +140,7 @@ class Relay:
         self._outboxes: list[Outbox] = []
         # The newest number of each frame, by origin, and how many that are in all.
         self._newest: dict[bytes, dict[str, int]] = {}
+        self._origins: dict[str, set[bytes]] = {}
         self._frames = 0
         self._latest: dict[str, Provenance] = {}
         self._settled: dict[str, Rank] = {}
@@ -175,7 +176,7 @@ class Relay:
             self._registration.close()
             self._newest.clear()
             self._frames = 0
-            for by_frame in (self._latest, self._settled, self._removed):
+            for by_frame in (self._origins, self._latest, self._settled, self._removed):
                 by_frame.clear()
             self._passed = None
 
@@ -190,8 +191,11 @@ class Relay:
         return None if latest is None else latest.rank
 
     def is_plausible(self, number: int) -> bool:
-        """Whether a number may be one that a bus has given by now."""
-        return number - self._number <= LARGEST_JUMP
+        """Whether a number may be one that a bus has given by now.
+
+        The time bounds it, not the newest number: else some thousand jumps would lead to the end of all numbers.
+        """
+        return number - time_ns() // 1_000 <= LARGEST_JUMP
 
     # Samples and removals of peers
 
@@ -274,10 +278,9 @@ class Relay:
         own = [frame for frame in sorted(frames) if frame in self._latest and self._latest[frame].origin == self.origin]
         if not own:
             return
-        latched: dict[str, TransformStamped] = {}
-        self._bus.subscribe(lambda batch: latched.update((sample.child, sample) for sample in batch)).close()
         for frame in own:
-            kept = (latched.get(frame), *(outbox.own_sample(frame) for outbox in self._outboxes))
+            latched = self._bus._topology.latched.get(frame)
+            kept = (latched, *(outbox.own_sample(frame) for outbox in self._outboxes))
             sample = next((sample for sample in kept if sample is not None), None)
             if sample is not None:
                 latest = self._latest[frame]
@@ -397,6 +400,7 @@ class Relay:
                     peer.frames.add(child)
                 # Other samples of the batch may be of the same child.
                 newest[child] = -1
+                self._origins.setdefault(child, set()).add(origin)
                 self._frames += 1
             elif known >= sequence:
                 continue
@@ -478,7 +482,7 @@ class Relay:
             self._removed[frame] = provenance.rank
             if len(self._removed) > _REMEMBERED:
                 del self._removed[next(iter(self._removed))]
-        for origin in [origin for origin, newest in self._newest.items() if frame in newest]:
+        for origin in list(self._origins.get(frame, ())):
             self._release(origin, frame)
 
     def _release(self, origin: bytes, frame: str) -> None:
@@ -487,6 +491,10 @@ class Relay:
         self._frames -= 1
         if not newest:
             del self._newest[origin]
+        origins = self._origins[frame]
+        origins.remove(origin)
+        if not origins:
+            del self._origins[frame]
 
     def _is_outranked(self, sample: ReceivedTransform, rank: Rank) -> bool:
         """Whether something else that was said of the frame holds: a removal, or a static sample of another bus."""

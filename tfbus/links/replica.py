@@ -54,7 +54,8 @@ RFC 4271).
 import heapq
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from itertools import islice
 from math import inf
 from random import uniform
 from typing import NamedTuple
@@ -76,6 +77,7 @@ MOST_REMEMBERED = 1_000
 PATIENCE = 3.0
 """s; so long a link waits for an answer."""
 _LONGEST_PAUSE = 60.0
+_ASK_AGAIN = 30.0
 _SPARE = 1_000
 _NEVER = -inf
 
@@ -125,6 +127,29 @@ class TooManyEntriesError(ValueError):
     """A bus, or all together, has more frames than a copy holds."""
 
 
+class Places:
+    """The room that all copies of one link have together.
+
+    Parameters
+    ----------
+    max_frames : int
+        How many frames one origin may have.
+
+    Attributes
+    ----------
+    held : Counter
+        How many frames each origin has, but for the own one.
+    taken, removals : int
+        How many frames and removals there are.
+    """
+
+    def __init__(self, max_frames: int) -> None:
+        self.max_frames = max_frames
+        self.held: Counter[bytes] = Counter()
+        self.taken = 0
+        self.removals = 0
+
+
 class Replica:
     """One copy of the map.
 
@@ -134,22 +159,23 @@ class Replica:
         How many frames one origin may have, but for the own one.
     own : bytes
         The own origin.
+    places : Places, optional
+        Shared by the copies of one link.
 
     Attributes
     ----------
     entries : dict of str to Entry
     """
 
-    def __init__(self, max_frames: int, own: bytes) -> None:
-        self._max_frames = max_frames
+    def __init__(self, max_frames: int, own: bytes, places: Places | None = None) -> None:
+        self._places = Places(max_frames) if places is None else places
         self._own = own
         self.entries: dict[str, Entry] = {}
-        self._held: Counter[bytes] = Counter()
         # A heap of the removals, the lowest ranks first; what was said of a frame since leaves its removal there.
         self._removals: list[tuple[Rank, str]] = []
         self._removed = 0
-        # Frames whose entries have changed since they were numbered last, and whether they are to settle first.
-        self._fresh: dict[str, bool] = {}
+        # Frames whose entries have changed since the last claim and are to settle first.
+        self._fresh: dict[str, None] = {}
         self._unsettled: dict[str, float] = {}
         self._sequences: dict[str, int] = {}
         self._log: list[tuple[int, str]] = []
@@ -179,18 +205,24 @@ class Replica:
         """
         number, origin = rank
         known = self.entries.get(frame)
-        if known is not None:
-            if number < known.number or (number == known.number and not self._replaces(origin, sample, known)):
-                return False
-            self._removed -= known.sample is None
-        if known is None or known.origin != origin or known.sample is None:
+        if known is not None and number <= known.number and not self._replaces(rank, sample, known):
+            return False
+        was_removed = known is not None and known.sample is None
+        if known is None or known.origin != origin or was_removed is not (sample is None):
             self._count(origin, known, sample)
+        self._forgive(was_removed)
         self.entries[frame] = Entry(number, origin, sample, ours)
-        self._fresh[frame] = settles
+        if settles:
+            self._fresh[frame] = None
+        else:
+            # At once, because a hundred thousand that wait for the next claim would take a turn of seconds.
+            self._fresh.pop(frame, None)
+            self._unsettled.pop(frame, None)
+            self._number(frame, settled=True)
         if sample is None:
-            self._removed += 1
+            self._forgive(-1)
             heapq.heappush(self._removals, (rank, frame))
-            if self._removed > MOST_REMOVALS or len(self._removals) > 2 * MOST_REMOVALS:
+            if self._too_many_removals or len(self._removals) > 2 * MOST_REMOVALS:
                 self._forget_removals()
         return True
 
@@ -220,9 +252,13 @@ class Replica:
         if since > self._sequence:
             since = 0
         found: list[OutgoingBatch | RemovedFrame] = []
-        for place in range(bisect_right(self._log, since, key=_first), len(self._log)):
-            sequence, frame = self._log[place]
-            if self._sequences.get(frame) == sequence and (frames is None or frame in frames):
+        log: Iterator[tuple[int, str]]
+        if frames is None:
+            log = islice(self._log, bisect_right(self._log, since, key=_first), None)
+        else:
+            log = iter(sorted((self._sequences[frame], frame) for frame in frames if frame in self._sequences))
+        for sequence, frame in log:
+            if sequence > since and self._sequences.get(frame) == sequence:
                 found.append(_told(frame, self.entries[frame]))
                 if len(found) == limit and sequence < self._sequence:
                     return found, Claim(since, sequence, 0, final=False)
@@ -246,35 +282,54 @@ class Replica:
             if entry.ours and entry.sample is not None and not entry.sample.static
         )
 
-    def _replaces(self, origin: bytes, sample: TransformStamped | None, known: Entry) -> bool:
-        if origin != known.origin:
-            return origin > known.origin
+    def _replaces(self, rank: Rank, sample: TransformStamped | None, known: Entry) -> bool:
+        if rank != (known.number, known.origin):
+            return rank > (known.number, known.origin)
         # Two samples of one batch.
         return sample is not None and known.sample is not None and sample.stamp > known.sample.stamp
 
     def _count(self, origin: bytes, known: Entry | None, sample: TransformStamped | None) -> None:
         if sample is not None and origin != self._own:
-            held = self._held[origin]
-            if held >= self._max_frames or len(self.entries) >= MANY_ORIGINS * self._max_frames:
-                if not held:
-                    del self._held[origin]
-                raise TooManyEntriesError(f"the peer has announced more than {self._max_frames} frames")
-            self._held[origin] += 1
-        if known is not None and known.sample is not None and known.origin != self._own:
-            self._held[known.origin] -= 1
-            if not self._held[known.origin]:
-                del self._held[known.origin]
+            held, most = self._places.held, self._places.max_frames
+            if held.get(origin, 0) >= most or self._places.taken >= MANY_ORIGINS * most:
+                raise TooManyEntriesError(f"the peer has announced more than {most} frames")
+            held[origin] += 1
+            self._places.taken += 1
+        if known is not None and known.sample is not None:
+            self._release(known.origin)
+
+    def _release(self, origin: bytes) -> None:
+        if origin != self._own:
+            held = self._places.held
+            held[origin] -= 1
+            self._places.taken -= 1
+            if not held[origin]:
+                del held[origin]
+
+    def forget(self) -> None:
+        """Give all places to the other copies."""
+        for entry in self.entries.values():
+            if entry.sample is not None:
+                self._release(entry.origin)
+        self._forgive(self._removed)
+        self.entries.clear()
+
+    def _forgive(self, removals: int) -> None:
+        """Count so many removals less."""
+        self._removed -= removals
+        self._places.removals -= removals
+
+    @property
+    def _too_many_removals(self) -> bool:
+        return self._removed > MOST_REMOVALS or self._places.removals > MANY_ORIGINS * MOST_REMOVALS
 
     def _settle(self, now: float) -> None:
         """Number the changes that have settled, and take those that have not out of the digest."""
-        for frame, settles in self._fresh.items():
+        for frame in self._fresh:
             self._digest ^= self._digests.pop(frame, 0)
             self._sequences.pop(frame, None)
             self._unsettled.pop(frame, None)
-            if settles:
-                self._unsettled[frame] = now
-            elif frame in self.entries:
-                self._number(frame, settled=True)
+            self._unsettled[frame] = now
         self._fresh.clear()
         while self._unsettled:
             frame = next(iter(self._unsettled))
@@ -293,24 +348,27 @@ class Replica:
         if settled:
             rank = b"%b%d %d " % (origin, number, sample is None)
             digest = int.from_bytes(hash_bytes(rank + frame.encode("utf-8", "surrogatepass"), 8), "little")
-            self._digest ^= digest
+            self._digest ^= digest ^ self._digests.get(frame, 0)
             self._digests[frame] = digest
 
     def _forget_removals(self) -> None:
         """Forget removals beyond the bound: those of the lowest ranks, so that all copies forget the same ones."""
-        while self._removed > MOST_REMOVALS:
+        while self._removed and self._too_many_removals:
             rank, frame = heapq.heappop(self._removals)
-            entry = self.entries.get(frame)
-            if entry is not None and entry.sample is None and (entry.number, entry.origin) == rank:
-                self._removed -= 1
+            if self._is_removed(frame, rank):
+                self._forgive(1)
                 del self.entries[frame]
                 self._fresh.pop(frame, None)
+                self._unsettled.pop(frame, None)
                 self._sequences.pop(frame, None)
                 self._digest ^= self._digests.pop(frame, 0)
         if len(self._removals) > 2 * MOST_REMOVALS:
-            entries = self.entries.items()
-            self._removals = [((entry.number, entry.origin), frame) for frame, entry in entries if entry.sample is None]
+            self._removals = [(rank, frame) for rank, frame in self._removals if self._is_removed(frame, rank)]
             heapq.heapify(self._removals)
+
+    def _is_removed(self, frame: str, rank: Rank) -> bool:
+        entry = self.entries.get(frame)
+        return entry is not None and entry.sample is None and (entry.number, entry.origin) == rank
 
 
 def _first(logged: tuple[int, str]) -> int:
@@ -326,10 +384,13 @@ def _told(frame: str, entry: Entry) -> OutgoingBatch | RemovedFrame:
 class _Copy:
     """The copy of one peer, as far as it is known."""
 
-    __slots__ = ("claim", "due", "fruitless", "missed", "replica", "seen", "silences")
+    __slots__ = ("again", "claim", "due", "fruitless", "missed", "must_ask", "replica", "seen", "silences")
 
-    def __init__(self, replica: Replica, seen: int) -> None:
+    def __init__(self, replica: Replica, seen: int, must_ask: bool) -> None:
         self.replica = replica
+        # It is asked again then, if no sign comes before, because it may not serve the filter.
+        self.again = inf
+        self.must_ask = must_ask
         # All changes up to this sequence are here.
         self.seen = seen
         self.claim: Claim | None = None
@@ -355,14 +416,15 @@ class Agreement:
 
     def __init__(self) -> None:
         self._copies: dict[str, _Copy] = {}
-        self._remembered: dict[str, int] = {}
+        self._remembered: dict[str, tuple[Replica, int]] = {}
         self._asked: Question | None = None
         self._patience = _NEVER
         self._is_new = True
 
     def joined(self, peer: str, replica: Replica, now: float, must_ask: bool = False) -> None:
         """Begin to follow the copy of a peer; it has to be asked if this is the first one, or if the caller says so."""
-        self._copies[peer] = copy = _Copy(replica, self._remembered.pop(peer, 0))
+        remembered, seen = self._remembered.pop(peer, (replica, 0))
+        self._copies[peer] = copy = _Copy(replica, seen if remembered is replica else 0, must_ask)
         if self._is_new or must_ask:
             self._is_new = False
             copy.due, copy.missed = now, True
@@ -371,7 +433,7 @@ class Agreement:
         """Follow the copy of a peer no more."""
         copy = self._copies.pop(peer, None)
         if copy is not None and copy.seen:
-            self._remembered[peer] = copy.seen
+            self._remembered[peer] = copy.replica, copy.seen
             if len(self._remembered) > MOST_REMEMBERED:
                 del self._remembered[next(iter(self._remembered))]
         if self._asked is not None and self._asked.peer == peer:
@@ -384,6 +446,7 @@ class Agreement:
         if copy is None or claim.partial or (copy.claim is not None and claim.sequence < copy.claim.sequence):
             return
         copy.claim = claim
+        copy.again = now + _ASK_AGAIN if copy.must_ask else inf
         if copy.silences:
             # It was stopped or cut off, and speaks again.
             copy.silences = 0
@@ -413,6 +476,7 @@ class Agreement:
             return
         copy.seen = claim.sequence
         copy.due = now
+        copy.again = now + _ASK_AGAIN if copy.must_ask else inf
         if claim.final:
             copy.due, copy.missed, copy.claim, copy.silences = inf, False, claim, 0
             copy.fruitless = 0 if news or self._agrees(copy, now) else min(copy.fruitless + 1, 10)
@@ -433,11 +497,12 @@ class Agreement:
             self.unanswered(self._asked.peer, now)
         while True:
             peer = min(self._copies, key=self._due_of, default=None)
-            if peer is None or self._copies[peer].due > now:
+            if peer is None or self._due_of(peer) > now:
                 return None
             copy = self._copies[peer]
-            copy.due = inf
-            if copy.missed or not self._agrees(copy, now):
+            again, copy.due = copy.again <= now, inf
+            copy.again = inf
+            if again or copy.missed or not self._agrees(copy, now):
                 self._asked, self._patience = Question(peer, copy.seen), now + PATIENCE
                 return self._asked
             copy.seen = max(copy.seen, 0 if copy.claim is None else copy.claim.sequence)
@@ -446,7 +511,7 @@ class Agreement:
         """The time at which `question` has to be called next."""
         if self._asked is not None:
             return self._patience
-        return min((copy.due for copy in self._copies.values()), default=inf)
+        return min(map(self._due_of, self._copies), default=inf)
 
     def _agrees(self, copy: _Copy, now: float) -> bool:
         return copy.claim is not None and copy.claim.digest == copy.replica.claim(now).digest
@@ -457,4 +522,5 @@ class Agreement:
         copy.due = now + min(uniform(0.3, 0.7) * 2**copy.silences, _LONGEST_PAUSE)
 
     def _due_of(self, peer: str) -> float:
-        return self._copies[peer].due
+        copy = self._copies[peer]
+        return min(copy.due, copy.again)

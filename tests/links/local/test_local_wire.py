@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 from support.local_links import ALL, Ear, RawPeer, files_in, framed, running
 from support.processes import OPEN_FILES, Program
 
-from tfbus.links.local import LocalWire
+from tfbus.links.local.local_wire import LocalWire
 from tfbus.links.local.local_wire import MOST_STRANGERS, MOST_UNFINISHED, matches
 from tfbus.links.wire import MAX_MESSAGE, Hearing, Joined, Left
 
@@ -400,7 +400,7 @@ async def test_a_process_of_another_user_cannot_talk_even_if_it_may_enter(direct
 PEER = """
 import os, signal, sys
 import anyio
-from tfbus.links.local import LocalWire
+from tfbus.links.local.local_wire import LocalWire
 from tfbus.links.wire import Hearing
 
 async def main():

@@ -29,6 +29,7 @@ _HELLO = struct.Struct(f"{len(_PROTOCOL)}s16s32s16s")
 _PROOF = 32
 _LINK = re.compile("[0-9a-f]{32}")
 _CHANNEL = re.compile("[A-Za-z0-9_-]{0,32}")
+_ROBOT = re.compile(r"[\w.-]{0,200}", re.ASCII)
 _FLAGS = getattr(socket, "MSG_NOSIGNAL", 0)
 
 
@@ -69,7 +70,10 @@ class Hello(NamedTuple):
             raise ValueError(f"a link speaks {protocol!r}, and this one {_PROTOCOL!r}")
         if digest != _digest(domain) or not _LINK.fullmatch(link.decode("ascii")):
             raise ValueError("a hello is of another domain, or has no id")
-        return cls(link.decode("ascii"), content[_HELLO.size :].decode(), content)
+        robot = content[_HELLO.size :].decode()
+        if not _ROBOT.fullmatch(robot):
+            raise ValueError("a hello has no name of a robot")
+        return cls(link.decode("ascii"), robot, content)
 
 
 def _digest(domain: str) -> bytes:

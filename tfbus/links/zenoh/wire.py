@@ -369,8 +369,13 @@ class _Hearer:
                 self._receive(sender.hex(), _content(sample))
 
     def take_token(self, index: int, sample: zenoh.Sample) -> None:
-        found = _TOKEN.fullmatch(str(sample.key_expr), self._rest)
-        if found is None or found["link"] == self._link:
+        key = str(sample.key_expr)
+        found = _TOKEN.fullmatch(key, self._rest)
+        if found is None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._receive("", MalformedMessageError("token", f"no link has the token {key[self._rest :][:100]}"))
+            return
+        if found["link"] == self._link:
             return
         link, number = found["link"], int(found["number"])
         robot = found["robot"] if found["robot"] != NO_ROBOT else ""
