@@ -249,7 +249,7 @@ def test_as_much_as_is_allowed_is_written_and_read_and_no_more() -> None:
     ids=["samples", "entries", "name", "surrogate", "number", "authority", "text", "stamp", "head", "bytes"],
 )
 def test_what_one_message_cannot_hold_is_a_value_error(entries: list[Entry]) -> None:
-    with pytest.raises(ValueError, match="."):
+    with pytest.raises(ValueError, match=r"."):
         write_message(LIVE, entries)
 
 

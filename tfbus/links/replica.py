@@ -182,9 +182,10 @@ class Replica:
         if known is not None:
             if number < known.number or (number == known.number and not self._replaces(origin, sample, known)):
                 return False
-            self._removed -= known.sample is None
-        if known is None or known.origin != origin or known.sample is None:
+        was_removed = known is not None and known.sample is None
+        if known is None or known.origin != origin or was_removed is not (sample is None):
             self._count(origin, known, sample)
+        self._removed -= was_removed
         self.entries[frame] = Entry(number, origin, sample, ours)
         self._fresh[frame] = settles
         if sample is None:
@@ -255,7 +256,7 @@ class Replica:
     def _count(self, origin: bytes, known: Entry | None, sample: TransformStamped | None) -> None:
         if sample is not None and origin != self._own:
             held = self._held[origin]
-            if held >= self._max_frames or len(self.entries) >= MANY_ORIGINS * self._max_frames:
+            if held >= self._max_frames or len(self.entries) - self._removed >= MANY_ORIGINS * self._max_frames:
                 if not held:
                     del self._held[origin]
                 raise TooManyEntriesError(f"the peer has announced more than {self._max_frames} frames")
