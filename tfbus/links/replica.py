@@ -179,8 +179,8 @@ class Replica:
         """
         number, origin = rank
         known = self.entries.get(frame)
-        if known is not None:
-            if number < known.number or (number == known.number and not self._replaces(origin, sample, known)):
+        if known is not None and number <= known.number:
+            if number < known.number or not self._replaces(origin, sample, known):
                 return False
         was_removed = known is not None and known.sample is None
         if known is None or known.origin != origin or was_removed is not (sample is None):
