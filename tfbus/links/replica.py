@@ -179,9 +179,8 @@ class Replica:
         """
         number, origin = rank
         known = self.entries.get(frame)
-        if known is not None and number <= known.number:
-            if number < known.number or not self._replaces(origin, sample, known):
-                return False
+        if known is not None and number <= known.number and not self._replaces(rank, sample, known):
+            return False
         was_removed = known is not None and known.sample is None
         if known is None or known.origin != origin or was_removed is not (sample is None):
             self._count(origin, known, sample)
@@ -247,9 +246,9 @@ class Replica:
             if entry.ours and entry.sample is not None and not entry.sample.static
         )
 
-    def _replaces(self, origin: bytes, sample: TransformStamped | None, known: Entry) -> bool:
-        if origin != known.origin:
-            return origin > known.origin
+    def _replaces(self, rank: Rank, sample: TransformStamped | None, known: Entry) -> bool:
+        if rank != (known.number, known.origin):
+            return rank > (known.number, known.origin)
         # Two samples of one batch.
         return sample is not None and known.sample is not None and sample.stamp > known.sample.stamp
 
