@@ -1,7 +1,6 @@
 """The promise of the link: some seconds after any trouble, all buses of a domain hold the same."""
 
 import pytest
-
 from support.domains import Network, Process, World, agree, shown
 from support.samples import moving, static
 

@@ -18,7 +18,7 @@ from tfbus.geometry.stamped import Batch
 from tfbus.links.carrier import Received, ReceiveQueue
 from tfbus.links.domain import DomainEnd
 from tfbus.links.endpoint import Endpoint, ForeignEnd
-from tfbus.links.message import Kind, Outgoing, kind_of, write_message
+from tfbus.links.message import NOTHING, Kind, Outgoing, kind_of, write_message
 from tfbus.links.outbox import OutgoingBatch, RemovedFrame
 from tfbus.links.replica import Claim
 from tfbus.links.wire import Hearing, Joined, Left, Receive, WireItem
@@ -231,7 +231,7 @@ class Stranger(Wire):
         *entries: OutgoingBatch | RemovedFrame,
         kind: Kind = Kind.LIVE,
         number: int | None = None,
-        claim: Claim = Claim(0, 0, 0),
+        claim: Claim = NOTHING,
         reach: Sequence[tuple[bytes, tuple[bytes, ...]]] = (),
     ) -> None:
         """Publish a message with the next number, or another one, and let it arrive."""
@@ -364,7 +364,7 @@ class Process:
         self.flush()
 
     def work(self) -> None:
-        self.due = max(min((end.work() for end in self.ends)), self.world.now + 0.0001)
+        self.due = max(min(end.work() for end in self.ends), self.world.now + 0.0001)
         self.flush()
 
     def flush(self) -> None:
