@@ -212,7 +212,7 @@ class Stranger(Wire):
 
     def __init__(self, network: Network, robot: str = "", channel: str = "all", bus: bytes = b"") -> None:
         super().__init__(network, robot)
-        self.hears = [Hearing("*", channel)]
+        self.hears = [Hearing("*", channel)] if channel else []
         self.bus = bus or network.world.random.randbytes(16)
         self.items: list[WireItem] = []
         self._number = 0
