@@ -1,8 +1,10 @@
 """The promise of the link: some seconds after any trouble, all buses of a domain hold the same."""
 
 import pytest
+from support.domains import Network, Process, World, agree, shown
+from support.samples import moving, static
 
-from tests.support.domains import Network, Process, World
+from tfbus.links.message import Kind
 
 NAMES = [f"static{k}" for k in range(5)]
 LIMIT = 10.0
@@ -50,14 +52,6 @@ def end_of_trouble(world: World, networks: list[Network]) -> None:
     for process in world.processes:
         if process.stopped:
             process.go_on()
-
-
-def shown(process: Process) -> dict[str, int]:
-    return {frame: sample.stamp for frame, sample in process.frames.items()}
-
-
-def agree(processes: list[Process]) -> bool:
-    return all(shown(process) == shown(processes[0]) for process in processes)
 
 
 def check_nothing_invented(world: World) -> None:
@@ -124,3 +118,106 @@ def test_buses_behind_bridges_and_in_rings_agree(seeds: range, drop_lost: bool) 
         end_of_trouble(world, networks)
         until_they_agree(world, [world.processes])
         check_nothing_invented(world)
+
+
+@pytest.mark.parametrize("seconds", [1.5, 7.0, 30.0])
+@pytest.mark.parametrize("trouble", ["stop", "cut", "inwards", "outwards"])
+@pytest.mark.parametrize("drop_lost", [False, True])
+def test_what_was_said_once_while_a_peer_was_away_arrives_soon_after(
+    trouble: str, seconds: float, drop_lost: bool
+) -> None:
+    for seed in range(5):
+        world = World(seed)
+        network = Network(world)
+        one, other, away = (world.process(network, drop_lost=drop_lost) for _ in range(3))
+        one.say(static("map", "gone"))
+        world.run(10.0)
+        match trouble:
+            case "stop":
+                away.stop()
+            case "cut":
+                network.cut(away.wire)
+            case "inwards":
+                network.cut(away.wire, outwards=False)
+            case "outwards":
+                network.cut(away.wire, inwards=False)
+        world.run(seconds / 2)
+        other.say(moving("map", "goal", 1))
+        one.say(static("map", "camera"))
+        one.remove("gone")
+        # More than a stopped process has room for.
+        for stamp in range(200):
+            other.say(moving("map", "base", stamp))
+        if trouble in ("cut", "inwards"):
+            away.say(moving("map", "own goal", 1), static("map", "own camera"))
+        world.run(seconds / 2)
+        network.heal()
+        if away.stopped:
+            away.go_on()
+        world.run(3.0)
+        assert agree(world.processes)
+        assert {"goal", "camera"} <= away.frames.keys()
+        assert "gone" not in away.frames
+
+
+@pytest.mark.parametrize("seconds", [0.01, 60.0])
+def test_what_a_killed_process_has_said_stays_for_all_and_for_late_joiners_or_for_nobody(seconds: float) -> None:
+    world = World()
+    network = Network(world)
+    keep, drop = world.process(network), world.process(network, drop_lost=True)
+    dies, ends = world.process(network), world.process(network)
+    dies.say(static("map", "camera"), moving("map", "goal", 1))
+    ends.say(static("map", "lidar"))
+    world.run(seconds)
+    world.kill(dies)
+    world.end(ends)
+    world.run(seconds)
+    late, late_drop = world.process(network), world.process(network, drop_lost=True)
+    world.run(5.0)
+    assert keep.frames.keys() == late.frames.keys() == {"camera", "goal", "lidar"}
+    assert drop.frames.keys() == late_drop.frames.keys() == set()
+    # Until somebody removes it, and for whoever was not there then.
+    away = world.process(network)
+    world.run(5.0)
+    network.cut(away.wire)
+    late.remove("camera")
+    keep.remove("goal")
+    network.heal()
+    later = world.process(network)
+    world.run(5.0)
+    assert [set(process.frames) for process in (keep, late, away, later)] == [{"lidar"}] * 4
+
+
+def test_copies_that_agree_cost_signs_only_and_ever_fewer() -> None:
+    world = World()
+    network = Network(world)
+    processes = [world.process(network) for _ in range(4)]
+    for place, process in enumerate(processes):
+        process.say(*(static("map", f"{place}/{number}") for number in range(100)))
+    world.run(10.0)
+    network.sent()
+    world.run(100.0)
+    others = set(Kind) - {Kind.SIGN}
+    assert sum(kind in others for kind, _ in network.carried) == 0
+    assert network.sent(Kind.SIGN) <= 4 * 3 * 51
+    # While something is published, signs come more often, and still nobody asks.
+    for stamp in range(100):
+        for process in processes:
+            process.say(moving("map", process.wire.id, stamp))
+        world.run(0.1)
+    assert sum(kind in (Kind.QUESTION, Kind.ANSWER) for kind, _ in network.carried) == 0
+
+
+def test_many_static_frames_reach_a_late_joiner_in_parts() -> None:
+    world = World()
+    network = Network(world)
+    one, other = world.process(network), world.process(network)
+    one.say(*(static("map", f"{number}") for number in range(3_000)))
+    other.say(*(static("map", f"other {number}") for number in range(10)))
+    world.run(10.0)
+    network.sent()
+    late = world.process(network)
+    world.run(1.0)
+    assert late.frames.keys() == one.frames.keys()
+    assert len(late.seen) == 3_010
+    assert network.sent(Kind.QUESTION) <= 8

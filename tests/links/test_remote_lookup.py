@@ -15,7 +15,7 @@ from tfbus import (
     Transform,
     TransformStamped,
 )
-from tfbus.links._remote_lookup import (
+from tfbus.links.remote_lookup import (
     MAX_BYTES,
     Cancellation,
     RemoteQuestion,

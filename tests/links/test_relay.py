@@ -1,0 +1,406 @@
+"""Buses that are joined in chains and rings: what is said once is heard once, everywhere, and the last word holds."""
+
+import copy
+import pickle
+import struct
+from collections.abc import Callable, Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import strategies as some
+from support.domains import Network, Process, World, agree
+from support.processes import peak_of
+from support.samples import moving, static
+
+from tfbus import SECOND, Buffer, Bus, PeerLost, SimulatedClock, TransformStamped
+from tfbus.links.relay import PassedSamples, ReceivedTransform
+from tfbus.tf_message import decode, encode
+
+Graph = Sequence[Sequence[int]]
+"""The buses of each of several domains, by their numbers."""
+
+GRAPHS: dict[str, Graph] = {
+    "pair": [[0, 1]],
+    "mesh": [[0, 1, 2, 3]],
+    "chain": [[0, 1], [1, 2], [2, 3]],
+    "ring": [[0, 1], [1, 2], [2, 0]],
+    "circle": [[0, 1], [1, 2], [2, 3], [3, 0]],
+    "ring with a tail": [[0, 1], [1, 2], [2, 0], [0, 3]],
+    "two bridges": [[0, 1, 2], [1, 2, 3]],
+    "triangle": [[0, 1, 2], [1, 2, 3], [2, 3, 0]],
+}
+
+
+def domains(graph: Graph, *, drop_lost: bool = False, seed: int = 0) -> tuple[World, list[Process]]:
+    world = World(seed)
+    networks = [Network(world) for _ in graph]
+    for number in range(1 + max(max(members) for members in graph)):
+        mine = [network for network, members in zip(networks, graph, strict=True) if number in members]
+        world.process(*mine, drop_lost=drop_lost)
+    world.run(5.0)
+    return world, list(world.processes)
+
+
+@pytest.mark.parametrize("graph", GRAPHS.values(), ids=GRAPHS)
+def test_every_bus_hears_each_batch_once_and_unchanged_with_its_authorities(graph: Graph) -> None:
+    world, processes = domains(graph)
+    said = []
+    for number, process in enumerate(processes):
+        authority = f"node of {number}"
+        batch = (
+            moving("map", f"{number}", number + 1, 1.0, authority),
+            moving("map", f"{number}", number + 9, 2.0),
+            static(f"{number}", f"s{number}", authority=authority),
+        )
+        process.say(*batch)
+        said.append(batch)
+        world.run(0.1)
+    world.run(20.0)
+    for process in processes:
+        assert sorted(tuple(map(repr, batch)) for batch in process.batches) == sorted(tuple(map(repr, b)) for b in said)
+        assert process.bus.statistics().callbacks_failed == 0
+
+
+@pytest.mark.parametrize("graph", GRAPHS.values(), ids=GRAPHS)
+def test_a_removed_frame_goes_everywhere_once_and_comes_back_with_what_is_said_later(graph: Graph) -> None:
+    world, processes = domains(graph)
+    processes[0].say(static("map", "a", 1.0), moving("map", "b", 5))
+    world.run(1.0)
+    processes[-1].remove("a")
+    processes[-1].remove("b")
+    world.run(10.0)
+    assert all(not process.frames for process in processes)
+    assert all(sorted(process.removed) == ["a", "b"] for process in processes)
+    processes[0].say(static("map", "a", 2.0), moving("map", "b", 4))
+    world.run(10.0)
+    assert agree(processes)
+    assert processes[-1].frames["a"].transform.translation[0] == 2.0
+    assert all(len(process.seen) == 4 for process in processes)
+
+
+@given(st.integers(0, 10**6), st.sampled_from(list(GRAPHS.values())), st.booleans())
+def test_of_what_several_say_of_one_frame_at_once_the_same_holds_everywhere(
+    seed: int, graph: Graph, moves: bool
+) -> None:
+    world, processes = domains(graph, seed=seed)
+    for step in range(6):
+        process = world.random.choice(processes)
+        match world.random.randrange(3 if moves else 2):
+            case 0:
+                process.say(static("map", "contended", float(step), stamp=step))
+            case 1:
+                process.remove("contended")
+            case 2:
+                process.say(moving("map", "contended", step))
+        world.run(world.random.choice([0.0, 0.001, 0.01]))
+    world.run(10.0)
+    if moves:
+        # Of moving samples of several buses, each bus shows the newest stamp that it has heard.
+        processes[seed % 2].say(moving("map", "contended", 9))
+        world.run(1.0)
+    last = [process.frames.get("contended") for process in processes]
+    assert all(sample == last[0] for sample in last)
+
+
+def test_a_late_joiner_hears_the_static_frames_and_the_newest_of_the_moving_ones() -> None:
+    world, (one, two, three) = domains([[0, 1], [1, 2]])
+    one.say(static("map", "camera", 1.0))
+    one.say(static("map", "camera", 2.0), moving("map", "base", 1), moving("map", "base", 3), moving("map", "base", 2))
+    world.run(3.0)
+    late = world.process(three.wire.network)
+    world.run(3.0)
+    assert sorted(late.seen, key=lambda sample: sample.child) == [
+        moving("map", "base", 3),
+        static("map", "camera", 2.0),
+    ]
+    assert two.frames["camera"] == static("map", "camera", 2.0)
+
+
+def test_a_bus_that_republishes_and_changes_what_it_hears_starts_no_loop_and_its_word_is_its_own() -> None:
+    world, (one, two, three) = domains(GRAPHS["ring"])
+
+    def republish(batch: Sequence[TransformStamped]) -> None:
+        if batch[0].child == "a" and len(two.seen) == 1:
+            two.bus.publish(batch)
+            two.bus.publish([sample.replace(child="changed", authority="two") for sample in batch])
+
+    two.bus.subscribe(republish)
+    one.say(moving("map", "a", 1, authority="one"))
+    world.run(5.0)
+    for process in (one, three):
+        assert [(sample.child, sample.authority) for sample in process.seen] == [("a", "one"), ("changed", "two")]
+
+
+def test_a_subscriber_may_answer_a_removal_with_another_and_with_the_frame_itself() -> None:
+    world, (one, two) = domains(GRAPHS["pair"])
+    one.say(static("map", "a"), static("map", "b"), static("map", "c"))
+    world.run(1.0)
+
+    def answer(frame: str) -> None:
+        if frame == "a":
+            two.bus.remove_frame("b")
+        if frame == "c":
+            two.bus.publish(static("map", "c", 2.0))
+
+    two.bus.subscribe(lambda _: None, answer)
+    one.remove("a")
+    one.remove("c")
+    world.run(5.0)
+    assert agree([one, two])
+    assert one.frames.keys() == {"c"}
+    assert one.frames["c"].transform.translation[0] == 2.0
+
+
+def test_a_link_that_begins_later_brings_what_its_bus_has_and_one_that_has_ended_brings_nothing() -> None:
+    world = World()
+    near, far = Network(world), Network(world)
+    one = world.process(near)
+    one.bus.publish(static("map", "before"))
+    one.flush()
+    bridge, other = world.process(near, far), world.process(far)
+    world.run(3.0)
+    assert other.frames.keys() == {"before"}
+    world.end(bridge)
+    one.say(static("map", "after"))
+    bridge.bus.publish(static("map", "alone"))
+    world.run(3.0)
+    assert (set(one.frames), set(other.frames)) == ({"before", "after"}, {"before"})
+
+
+def test_a_program_that_starts_again_is_right_against_what_it_has_said_before() -> None:
+    world, (one, two) = domains(GRAPHS["pair"])
+    one.say(static("map", "camera", 1.0), static("map", "lidar", 1.0))
+    one.remove("lidar")
+    world.run(1.0)
+    world.kill(one)
+    again = world.process(two.wire.network)
+    again.say(static("map", "camera", 2.0), static("map", "lidar", 2.0))
+    world.run(5.0)
+    for process in (two, again):
+        assert [process.frames[name].transform.translation[0] for name in ("camera", "lidar")] == [2.0, 2.0]
+
+
+# Who is lost
+
+
+def losses(process: Process) -> list[tuple[tuple[str, ...], tuple[str, ...]]]:
+    """The frames and the authorities of the peers that a process has lost."""
+    found = []
+    with process.bus.events(stale_after=None) as events:
+        process.world.run(5.0)
+        while (event := events.queue.get()) is not None:
+            if isinstance(event, PeerLost):
+                found.append((event.frames, event.authorities))
+    return found
+
+
+@pytest.mark.parametrize("drop_lost", [False, True])
+def test_a_lost_peer_is_told_with_its_frames_which_stay_or_go(drop_lost: bool) -> None:
+    world, (one, two, three) = domains([[0, 1, 2]], drop_lost=drop_lost)
+    one.say(moving("map", "a", 1, authority="slam"), static("map", "b", authority="driver"), moving("map", "c", 1))
+    world.run(1.0)
+    # It is the last to speak of this frame.
+    three.say(moving("map", "c", 2))
+    world.run(1.0)
+    world.arrive(0, 0, lambda: world.kill(one), 1.0)
+    assert losses(two) == [(("a", "b"), ("", "driver", "slam"))]
+    assert set(two.frames) == set(three.frames) == ({"c"} if drop_lost else {"a", "b", "c"})
+
+
+def test_the_frames_of_a_lost_bus_go_also_behind_a_bridge_and_come_back_with_it() -> None:
+    world, (one, bridge, far) = domains([[0, 1], [1, 2]], drop_lost=True)
+    one.say(static("map", "camera"), moving("map", "base", 1))
+    far.say(static("map", "lidar"))
+    world.run(1.0)
+    network = one.wire.network
+    network.cut(one.wire)
+    world.run(1.0)
+    assert [set(process.frames) for process in (one, bridge, far)] == [{"camera", "base"}, {"lidar"}, {"lidar"}]
+    network.heal()
+    world.run(5.0)
+    assert [len(process.frames) for process in (one, bridge, far)] == [3, 3, 3]
+    world.kill(bridge)
+    world.run(1.0)
+    assert [set(process.frames) for process in (one, far)] == [{"camera", "base"}, {"lidar"}]
+    world.process(one.wire.network, far.wire.network, drop_lost=True)
+    world.run(5.0)
+    assert agree(world.processes)
+    assert len(far.frames) == 3
+
+
+def test_a_ring_that_is_cut_keeps_all_frames_and_loses_those_of_a_bus_that_dies() -> None:
+    world, (one, two, three) = domains(GRAPHS["ring"], drop_lost=True)
+    for number, process in enumerate((one, two, three)):
+        process.say(static("map", f"{number}"))
+    world.run(1.0)
+    one.wires[0].network.cut(one.wires[0])
+    world.run(5.0)
+    assert agree(world.processes)
+    assert len(one.frames) == 3
+    assert [process.removed for process in (one, two, three)] == [[], [], []]
+    world.kill(one)
+    world.run(5.0)
+    assert two.frames.keys() == three.frames.keys() == {"1", "2"}
+
+
+def test_a_frame_that_a_lost_bus_has_taken_over_is_gone_until_it_is_said_again() -> None:
+    world, (one, two, three) = domains([[0, 1, 2]], drop_lost=True)
+    one.say(static("map", "tool", 1.0))
+    world.run(1.0)
+    two.say(static("map", "tool", 2.0))
+    world.run(1.0)
+    world.kill(two)
+    world.run(5.0)
+    assert one.frames == three.frames == {}
+    one.say(static("map", "tool", 3.0))
+    late = world.process(one.wire.network, drop_lost=True)
+    world.run(5.0)
+    assert one.frames == three.frames == late.frames == {"tool": static("map", "tool", 3.0)}
+
+
+@pytest.mark.thorough
+def test_frames_that_come_and_go_by_the_ten_thousand_leave_little_behind() -> None:
+    world, (one, two) = domains(GRAPHS["pair"])
+
+    def come_and_go(turn: int, count: int = 500) -> None:
+        for number in range(count):
+            one.say(moving("map", f"{turn}/{number}", number))
+            one.remove(f"{turn}/{number}")
+        world.run(1.0)
+        for process in (one, two):
+            for heard in (process.seen, process.batches, process.removed):
+                heard.clear()
+
+    for turn in range(21):
+        come_and_go(turn)
+    assert peak_of(lambda: come_and_go(99, 100)) < 3_000_000
+    assert not one.frames
+    assert not two.frames
+    assert two.end.peers.rejected == {}
+
+
+def test_an_ended_link_forgets_and_its_bus_can_go_on_or_close() -> None:
+    world, (one, two) = domains(GRAPHS["pair"])
+    one.say(static("map", "a"))
+    world.run(1.0)
+    world.end(one)
+    one.bus.publish(static("map", "b"))
+    one.bus.close()
+    two.bus.close()
+    world.run(5.0)
+    assert two.end.peers.rejected == {}
+
+
+# Samples that came over a link
+
+SHARED: list[Callable[[TransformStamped], TransformStamped]] = [
+    copy.copy,
+    copy.deepcopy,
+    *[lambda sample, n=n: pickle.loads(pickle.dumps(sample, n)) for n in range(2, pickle.HIGHEST_PROTOCOL + 1)],
+]
+
+
+def received(sample: TransformStamped) -> TransformStamped:
+    """The same sample as it comes over a link."""
+    world, (one, two) = domains(GRAPHS["pair"])
+    one.say(sample)
+    world.run(1.0)
+    assert type(two.seen[0]) is ReceivedTransform
+    return two.seen[0]
+
+
+def bits(sample: TransformStamped) -> tuple[object, ...]:
+    """Everything in a sample, with numbers that only a bit tells apart kept apart."""
+    row = *sample.transform.translation, *sample.transform.rotation
+    return sample.parent, sample.child, sample.stamp, struct.pack("<7d", *row), sample.authority, sample.static
+
+
+@given(sample=some.samples(at=some.stamps(0, 2**31 * SECOND - 1)))
+def test_a_received_sample_is_that_which_was_sent_to_the_bit_and_a_copy_is_a_plain_one(
+    sample: TransformStamped,
+) -> None:
+    twin = received(sample)
+    assert twin == sample
+    assert {sample: 1}[twin] == 1
+    assert (repr(twin), str(twin), bits(twin)) == (repr(sample), str(sample), bits(sample))
+    for share in SHARED:
+        assert type(share(twin)) is TransformStamped
+        assert bits(share(twin)) == bits(sample)
+
+
+def test_a_received_sample_differs_from_others_and_changed_or_answered_it_is_a_plain_one() -> None:
+    sample = received(moving("map", "a", 1, 2.0, "odometry"))
+    assert sample not in (moving("map", "a", 2), "a")
+    changed = sample.replace(stamp=5)
+    assert type(changed) is TransformStamped
+    assert changed == moving("map", "a", 5, 2.0, "odometry")
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        bus.publish([sample])
+        assert type(buffer.lookup_nowait("map", "a", 1)) is TransformStamped
+
+
+def test_a_quaternion_that_is_a_little_off_is_normalised_once_and_then_copied_as_it_is() -> None:
+    message = bytearray(encode([moving("map", "a", 1)]))
+    message[-32:] = struct.pack("<4d", 0.1, 0.2, 0.3, 0.93)
+    (twin,) = decode(bytes(message), None, ReceivedTransform).samples
+    assert twin is not None
+    assert all(bits(share(twin)) == bits(twin) for share in SHARED)
+
+
+# What passed over a bus beside worlds without origins
+
+
+def passed(*samples: TransformStamped, per_child: int = 3, gone_children: int = 2) -> PassedSamples:
+    memory = PassedSamples(per_child, gone_children)
+    for sample in samples:
+        memory.add(sample)
+    return memory
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "same"),
+    [
+        (moving("map", "a", 5), moving("map", "a", 5), True),
+        (moving("map", "a", 5, 1.0, "x"), moving("map", "a", 5, 2.0, "y"), True),
+        (moving("map", "a", 5), moving("map", "a", 6), False),
+        (moving("map", "a", 5), moving("odom", "a", 5), False),
+        (moving("map", "a", 5), moving("map", "b", 5), False),
+        (moving("map", "a", 5), static("map", "a", stamp=5), False),
+        (static("map", "a", stamp=5), moving("map", "a", 5), False),
+        (static("map", "a", 1.0, authority="x"), static("map", "a", 1.0, authority="y"), True),
+        (static("map", "a", 1.0), static("map", "a", 2.0), False),
+        (static("map", "a", 1.0), static("map", "a", 1.0, stamp=1), False),
+    ],
+)
+def test_a_sample_is_known_by_child_parent_stamp_and_kind_and_a_static_one_by_its_value(
+    first: TransformStamped, second: TransformStamped, same: bool
+) -> None:
+    assert (second in passed(first)) is same
+
+
+def test_so_many_samples_of_each_child_are_remembered_and_what_passes_again_is_new() -> None:
+    samples = [moving("map", "a", stamp) for stamp in range(5)]
+    memory = passed(moving("map", "b", 0), *samples[:3], samples[0], samples[3])
+    assert [sample in memory for sample in samples] == [True, False, True, True, False]
+    assert moving("map", "b", 0) in memory
+
+
+def test_children_that_left_are_remembered_up_to_a_bound_and_one_that_came_back_as_before() -> None:
+    memory = passed(*(moving("map", name, 1) for name in ("back", "stays", *"abc")))
+    memory.retire("back")
+    memory.add(moving("map", "back", 2))
+    for name in ("never there", *"abac"):
+        memory.retire(name)
+    known = {name: moving("map", name, 1) in memory for name in ("back", "stays", *"abc")}
+    assert known == {"back": True, "stays": True, "a": True, "b": False, "c": True}
+
+
+def test_after_a_jump_back_only_static_samples_are_known_and_of_a_forgotten_child_none() -> None:
+    samples = moving("map", "a", 1), static("map", "a"), moving("map", "b", 1), static("map", "c")
+    memory = passed(*samples)
+    memory.retire("b")
+    memory.forget_moving()
+    memory.forget("c")
+    memory.forget("never there")
+    assert [sample in memory for sample in samples] == [False, True, False, False]

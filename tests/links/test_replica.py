@@ -1,0 +1,459 @@
+"""The copies of the map against a plain model, and the questions by which they come to agree."""
+
+import random
+from collections.abc import Iterable
+from math import inf
+
+import pytest
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from support.processes import peak_of
+from support.samples import moving, static
+
+from tfbus import TransformStamped
+from tfbus.links.outbox import OutgoingBatch, RemovedFrame
+from tfbus.links.replica import (
+    CHUNK,
+    MANY_ORIGINS,
+    MOST_REMEMBERED,
+    MOST_REMOVALS,
+    PATIENCE,
+    SETTLING,
+    Agreement,
+    Claim,
+    Question,
+    Replica,
+    TooManyEntriesError,
+)
+
+OWN, OTHER = b"the own bus.....", b"another bus....."
+Model = dict[str, tuple[int, bytes]]
+NAMES = "abcdef"
+
+
+def said(frame: str, number: int) -> TransformStamped | None:
+    """What is said of a frame with a number: a removal, a static or a moving sample."""
+    return (None, static("map", frame, stamp=number), moving("map", frame, number))[number % 3]
+
+
+def rank_of(told: OutgoingBatch | RemovedFrame) -> tuple[str, tuple[int, bytes]]:
+    frame = told.frame if isinstance(told, RemovedFrame) else told.samples[0].child
+    sample = None if isinstance(told, RemovedFrame) else told.samples[0]
+    assert sample == said(frame, told.sequence)
+    return frame, (told.sequence, told.origin)
+
+
+def ranks_in(replica: Replica) -> Model:
+    return {frame: (entry.number, entry.origin) for frame, entry in replica.entries.items()}
+
+
+class Copies(RuleBasedStateMachine):
+    """Two copies that hear of different things, and one asker of each, which learns by answers only."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = 100.0
+        self.copies = [Replica(100, OWN), Replica(100, OWN)]
+        self.models: list[Model] = [{}, {}]
+        self.learnt: list[Model] = [{}, {}]
+        self.seen = [0, 0]
+
+    @rule(which=st.integers(0, 1), frame=st.sampled_from(NAMES), number=st.integers(1, 12), own=st.booleans())
+    def note(self, which: int, frame: str, number: int, own: bool) -> None:
+        rank = number, OWN if own else OTHER
+        sample = said(frame, number)
+        settles = sample is not None and not sample.static
+        is_new = self.copies[which].note(frame, rank, sample, ours=own, settles=settles)
+        assert is_new is (rank > self.models[which].get(frame, (-1, b"")))
+        if is_new:
+            self.models[which][frame] = rank
+
+    @rule(seconds=st.sampled_from((0.0, 0.5, SETTLING, 100.0)), look=st.booleans())
+    def wait(self, seconds: float, look: bool) -> None:
+        self.now += seconds
+        if look:
+            for copy in self.copies:
+                copy.claim(self.now)
+
+    @rule(which=st.integers(0, 1), limit=st.sampled_from((1, 2, CHUNK)))
+    def ask(self, which: int, limit: int) -> None:
+        """An answer tells changes up to a sequence, and the last one all that is new."""
+        since = self.seen[which]
+        told, claim = self.copies[which].changes(since, self.now, limit=limit)
+        assert claim.since == since
+        assert len(told) <= limit
+        assert claim.sequence > since or claim.final
+        self.learnt[which].update(map(rank_of, told))
+        self.seen[which] = claim.sequence
+        if claim.final:
+            assert self.learnt[which] == self.models[which]
+            assert claim == self.copies[which].claim(self.now)._replace(since=since)
+
+    @rule(which=st.integers(0, 1))
+    def begin_anew(self, which: int) -> None:
+        """A sequence that was never reached is answered with the beginning of all."""
+        told, claim = self.copies[which].changes(10**9, self.now)
+        assert (claim.since, claim.final) == (0, True)
+        assert dict(map(rank_of, told)) == self.models[which]
+        assert len(told) == len(self.models[which])
+
+    @rule()
+    def exchange(self) -> None:
+        """Each tells the other all; then both have the same, in whatever order it came."""
+        answers = [copy.changes(0, self.now)[0] for copy in self.copies]
+        for copy, model, answer in zip(self.copies, self.models, reversed(answers), strict=True):
+            for frame, rank in map(rank_of, answer):
+                copy.note(frame, rank, said(frame, rank[0]))
+                model[frame] = max(rank, model.get(frame, rank))
+        assert self.models[0] == self.models[1]
+
+    @rule(frames=st.none() | st.sets(st.sampled_from(NAMES)))
+    def settle(self, frames: set[str] | None) -> None:
+        """When all has settled, digests are equal if the entries are, removals among them, and only then."""
+        for _ in range(2):
+            claims = [copy.claim(self.now, frames) for copy in self.copies]
+            self.now += SETTLING
+        parts = [{f: rank for f, rank in model.items() if frames is None or f in frames} for model in self.models]
+        assert (claims[0].digest == claims[1].digest) is (parts[0] == parts[1])
+        told = [dict(map(rank_of, copy.changes(0, self.now, frames)[0])) for copy in self.copies]
+        assert told == parts
+
+    @invariant()
+    def it_holds_the_highest_of_each_frame(self) -> None:
+        assert [ranks_in(copy) for copy in self.copies] == self.models
+        for copy in self.copies:
+            for frame, entry in copy.entries.items():
+                assert entry.sample == said(frame, entry.number)
+            here = [f for f, entry in copy.entries.items() if entry.ours and entry.sample is not None]
+            ours = copy.ours(len(NAMES))
+            assert ours is not None
+            assert sorted(frame for frame, _ in map(rank_of, ours)) == sorted(here)
+            assert (copy.ours(len(here) - 1) is None) is (len(here) > 0)
+            assert copy.moving() == sorted(f for f in here if copy.entries[f].number % 3 == 2)
+
+
+TestCopies = Copies.TestCase
+
+
+def filled(frames: Iterable[str], number: int = 1, origin: bytes = OTHER, max_frames: int = 100) -> Replica:
+    replica = Replica(max_frames, OWN)
+    for frame in frames:
+        replica.note(frame, (number, origin), static("map", frame))
+    return replica
+
+
+def test_a_frame_that_moves_all_the_time_is_not_in_the_digest_until_it_rests() -> None:
+    replica, still = filled("a"), filled("a")
+    for step in range(100):
+        replica.note("m", (2 + step, OTHER), moving("map", "m", step), settles=True)
+        assert replica.claim(step * 0.1).digest == still.claim(0.0).digest
+    # It is told to who asks, settled or not.
+    assert len(replica.changes(0, 10.0)[0]) == 2
+    rested = replica.claim(9.9 + SETTLING)
+    still.note("m", (101, OTHER), moving("map", "m", 99))
+    assert rested.digest == still.claim(20.0).digest
+
+
+def test_of_two_samples_of_one_batch_the_newer_is_held() -> None:
+    replica = Replica(10, OWN)
+    assert replica.note("a", (1, OTHER), moving("map", "a", 5))
+    assert not replica.note("a", (1, OTHER), moving("map", "a", 4))
+    assert replica.note("a", (1, OTHER), moving("map", "a", 6))
+    assert not replica.note("a", (1, OTHER), None)
+
+
+def test_a_bus_has_so_many_frames_and_all_together_so_many_times_more() -> None:
+    replica = filled("ab", max_frames=2)
+    with pytest.raises(TooManyEntriesError, match="more than 2 frames"):
+        replica.note("c", (2, OTHER), static("map", "c"))
+    assert sorted(replica.entries) == ["a", "b"]
+    replica.note("b", (2, OTHER), static("map", "b", 2.0))
+    replica.note("a", (2, OTHER), None)
+    replica.note("c", (3, OTHER), static("map", "c"))
+    # A frame that another bus has taken over counts for that one.
+    replica.note("c", (4, b"a third"), static("map", "c"))
+    replica.note("d", (4, OTHER), static("map", "d"))
+    for number in range(100):
+        replica.note(f"own {number}", (1, OWN), static("map", f"own {number}"), ours=True)
+    replica = Replica(2, OWN)
+    for number in range(2 * MANY_ORIGINS):
+        replica.note(f"{number}", (1, b"%16d" % number), static("map", f"{number}"))
+    with pytest.raises(TooManyEntriesError):
+        replica.note("more", (1, b"one more origin."), static("map", "more"))
+
+
+def test_removals_take_no_room_of_frames() -> None:
+    replica = Replica(2, OWN)
+    for number in range(3 * MANY_ORIGINS):
+        for sample in (static("map", f"{number}"), None):
+            replica.note(f"{number}", (2 * number + (sample is None), OTHER), sample)
+    replica.note("a", (10**6, OTHER), static("map", "a"))
+    replica.note("b", (10**6, OTHER), static("map", "b"))
+    for _ in range(MOST_REMOVALS):
+        with pytest.raises(TooManyEntriesError):
+            replica.note("0", (10**6, OTHER), static("map", "0"))
+    for number in range(MOST_REMOVALS + 1):
+        replica.note(f"more {number}", (10**6 + number, OTHER), None)
+    assert len(replica.entries) == MOST_REMOVALS + 2
+
+
+def test_copies_forget_the_same_removals_in_whatever_order_they_come() -> None:
+    removals = [(f"f{number}", (number, OTHER)) for number in range(MOST_REMOVALS + 2_000)]
+    copies = []
+    for seed in range(2):
+        replica = Replica(10, OWN)
+        random.Random(seed).shuffle(removals)
+        for place, (frame, rank) in enumerate(removals):
+            replica.note(frame, rank, None)
+            if place % 1_000 == seed:
+                replica.claim(place)
+        copies.append(replica)
+    expected = {f"f{number}" for number in range(2_000, MOST_REMOVALS + 2_000)}
+    assert [set(replica.entries) for replica in copies] == [expected, expected]
+    assert copies[0].claim(1e6).digest == copies[1].claim(1e6).digest
+    told = set()
+    claim = Claim(0, 0, 0, final=False)
+    while not claim.final:
+        chunk, claim = copies[0].changes(claim.sequence, 1e6)
+        told |= {entry.frame for entry in chunk if isinstance(entry, RemovedFrame)}
+    assert told == expected
+
+
+@pytest.mark.thorough
+def test_frames_that_come_go_and_change_for_ever_take_no_more_memory() -> None:
+    replica = filled("a")
+    numbers = iter(range(2, 10**9))
+
+    def change() -> None:
+        for _ in range(40_000):
+            replica.note("a", (next(numbers), OTHER), static("map", "a"))
+            replica.note("b", (next(numbers), OTHER), None)
+            replica.claim(1.0)
+
+    change()
+    assert peak_of(change) < 4_500_000
+
+
+# Whom to ask, and when
+
+
+class Asker:
+    """One link that follows the copies of some peers, which a test fills."""
+
+    def __init__(self, *peers: str) -> None:
+        random.seed(1)
+        self.now = 0.0
+        self.replica = Replica(1_000, OWN)
+        self.agreement = Agreement()
+        self.peers = {peer: Replica(1_000, peer.encode()) for peer in peers}
+        self.number = 0
+        for peer in peers:
+            self.agreement.joined(peer, self.replica, self.now)
+
+    def say(self, *peers: str, heard: bool = True) -> None:
+        """Some peers hold a new entry; the link hears it live, or does not."""
+        self.number += 1
+        frame, rank = f"f{self.number}", (self.number, OTHER)
+        for replica in [self.peers[peer] for peer in peers] + [self.replica] * heard:
+            replica.note(frame, rank, static("map", frame))
+
+    def sign(self, peer: str) -> None:
+        self.agreement.told(peer, self.peers[peer].claim(self.now), self.now)
+
+    def next_question(self, within: float = 1e6) -> Question | None:
+        """Let time pass until there is a question."""
+        end = self.now + within
+        while (question := self.agreement.question(self.now)) is None:
+            if self.agreement.next_due() > end:
+                self.now = end
+                return None
+            self.now = max(self.now, self.agreement.next_due())
+        return question
+
+    def answer(self, question: Question, limit: int = CHUNK) -> Claim:
+        told, claim = self.peers[question.peer].changes(question.since, self.now, limit=limit)
+        news = [self.replica.note(frame, rank, static("map", frame)) for frame, rank in map(self._rank, told)]
+        self.agreement.answered(question.peer, claim, any(news), self.now)
+        return claim
+
+    @staticmethod
+    def _rank(told: OutgoingBatch | RemovedFrame) -> tuple[str, tuple[int, bytes]]:
+        assert isinstance(told, OutgoingBatch)
+        return told.samples[0].child, (told.sequence, told.origin)
+
+
+def test_the_first_peer_is_asked_for_all_at_once_and_others_only_if_they_differ() -> None:
+    link = Asker("a", "b")
+    link.say("a", "b", heard=False)
+    assert link.next_question(0.0) == Question("a", 0)
+    assert link.agreement.question(link.now) is None, "there is one question at a time"
+    link.sign("b")
+    link.answer(Question("a", 0))
+    assert link.next_question() is None
+    link.say("b", heard=False)
+    link.sign("b")
+    asked_from = link.now
+    question = link.next_question()
+    assert question is not None
+    assert question.peer == "b"
+    assert 0.3 <= link.now - asked_from <= 0.7
+    link.answer(question)
+    assert link.next_question() is None
+    assert ranks_in(link.replica) == ranks_in(link.peers["b"])
+
+
+def test_equal_digests_need_no_question_and_what_comes_meanwhile_makes_one_needless() -> None:
+    link = Asker("a")
+    link.answer(link.next_question() or Question("", 0))
+    for _ in range(10):
+        link.say("a")
+        link.sign("a")
+        assert link.next_question(10.0) is None
+    link.say("a", heard=False)
+    link.sign("a")
+    assert link.agreement.next_due() < inf
+    link.replica.note("f11", (11, OTHER), static("map", "f11"))
+    assert link.next_question(10.0) is None
+
+
+def test_much_is_told_in_chunks_one_behind_the_other() -> None:
+    link = Asker("a")
+    for _ in range(25):
+        link.say("a", heard=False)
+    questions = []
+    while (question := link.next_question(0.0)) is not None:
+        questions.append(question.since)
+        link.answer(question, limit=10)
+    assert questions == [0, 10, 20]
+    assert ranks_in(link.replica) == ranks_in(link.peers["a"])
+
+
+def test_a_missing_live_message_is_a_reason_to_ask_soon_whatever_the_digests() -> None:
+    link = Asker("a")
+    link.answer(link.next_question() or Question("", 0))
+    link.sign("a")
+    link.agreement.missed("a", link.now)
+    asked_from = link.now
+    assert link.next_question() == Question("a", 0)
+    assert 0.05 <= link.now - asked_from <= 0.2
+    link.agreement.missed("nobody", link.now)
+
+
+def test_a_peer_that_comes_back_is_asked_for_what_is_new() -> None:
+    link = Asker("a")
+    link.say("a", heard=False)
+    link.answer(link.next_question() or Question("", 0))
+    link.agreement.left("a")
+    link.say("a", heard=False)
+    link.agreement.joined("a", link.replica, link.now)
+    link.sign("a")
+    question = link.next_question()
+    assert question == Question("a", 1)
+    link.answer(question)
+    # It may have begun anew meanwhile.
+    link.agreement.left("a")
+    link.peers["a"] = Replica(10, b"a")
+    link.say("a", heard=False)
+    link.agreement.joined("a", link.replica, link.now, must_ask=True)
+    question = link.next_question()
+    assert question == Question("a", 2)
+    assert link.answer(question).since == 0
+    assert ranks_in(link.replica).items() >= ranks_in(link.peers["a"]).items()
+    for number in range(MOST_REMEMBERED + 1):
+        link.agreement.joined(f"{number}", link.replica, link.now, must_ask=True)
+        asked = link.next_question()
+        assert asked is not None
+        link.agreement.answered(asked.peer, Claim(0, 5, 0), True, link.now)
+        link.agreement.left(asked.peer)
+    for peer, since in (("0", 0), ("1", 5), (f"{MOST_REMEMBERED}", 5)):
+        link.agreement.joined(peer, link.replica, link.now, must_ask=True)
+        assert link.next_question() == Question(peer, since)
+        link.agreement.left(peer)
+
+
+def pauses(link: Asker, times: int, end: str) -> list[float]:
+    """The times from the end of one question to the next, if none is of use."""
+    found = []
+    for _ in range(times):
+        before = link.now
+        link.sign("a")
+        question = link.next_question()
+        assert question is not None
+        found.append(link.now - before)
+        if end == "unanswered":
+            link.agreement.unanswered("a", link.now)
+        elif end == "late":
+            link.now += PATIENCE
+            assert link.agreement.question(link.now) is None
+        else:
+            # What it claims is not what it tells.
+            sequence = link.peers["a"].claim(link.now).sequence
+            link.agreement.answered("a", Claim(question.since, sequence, 1), False, link.now)
+            link.say("a", heard=False)
+    return found
+
+
+@pytest.mark.parametrize("end", ["unanswered", "late", "fruitless"])
+def test_a_peer_whose_answers_are_of_no_use_is_asked_ever_less_often(end: str) -> None:
+    link = Asker("a")
+    if end == "fruitless":
+        link.say("a", heard=False)
+        link.answer(link.next_question() or Question("", 0))
+        link.say("a", heard=False)
+    found = pauses(link, 15, end)
+    if end == "fruitless":
+        assert all(0.3 * 2**count <= pause or pause > 59.9 for count, pause in enumerate(found))
+        assert 59.9 < max(found) < 60.1
+    else:
+        # A sign shows that it lives, so it is asked again soon.
+        assert max(found) < 0.21
+
+
+def test_a_silent_peer_without_a_sign_of_life_is_asked_ever_less_often_and_others_meanwhile() -> None:
+    link = Asker("a")
+    found = []
+    for _ in range(12):
+        before = link.now
+        assert link.next_question() == Question("a", 0)
+        found.append(link.now - before)
+        link.agreement.unanswered("a", link.now)
+    assert found[0] == 0.0
+    assert all(0.6 * 2**count <= pause or pause > 59.9 for count, pause in enumerate(found[1:]))
+    assert 59.9 < max(found) < 60.1
+    link.agreement.joined("b", link.replica, link.now, must_ask=True)
+    assert link.next_question(0.0) == Question("b", 0)
+
+
+def test_an_answer_that_leads_nowhere_or_was_not_asked_for_changes_nothing() -> None:
+    link = Asker("a", "b")
+    link.agreement.answered("a", Claim(0, 9, 0), True, link.now)
+    assert link.next_question(0.0) == Question("a", 0)
+    link.agreement.answered("b", Claim(0, 9, 0), True, link.now)
+    link.agreement.answered("nobody", Claim(0, 9, 0), True, link.now)
+    assert link.agreement.question(link.now) is None
+    link.agreement.answered("a", Claim(0, 0, 0, final=False), False, link.now)
+    assert link.agreement.question(link.now) is None, "it is asked again after a pause"
+    assert link.next_question() == Question("a", 0)
+    assert link.now > 0.5
+
+
+def test_a_claim_of_some_frames_only_and_one_that_was_overtaken_say_nothing() -> None:
+    link = Asker("a")
+    link.answer(link.next_question() or Question("", 0))
+    link.agreement.told("a", Claim(9, 9, 9, partial=True), link.now)
+    assert link.next_question(100.0) is None
+    link.say("a")
+    link.say("a")
+    link.sign("a")
+    link.agreement.told("a", Claim(1, 1, 77), link.now)
+    link.agreement.told("nobody", Claim(1, 1, 77), link.now)
+    assert link.next_question(100.0) is None
+
+
+def test_when_the_peer_leaves_that_was_asked_first_the_next_one_is_asked_for_all() -> None:
+    link = Asker("a")
+    assert link.next_question(0.0) == Question("a", 0)
+    link.agreement.left("a")
+    link.agreement.left("a")
+    link.agreement.joined("b", link.replica, link.now)
+    assert link.next_question(0.0) == Question("b", 0)
