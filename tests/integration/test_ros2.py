@@ -28,7 +28,7 @@ from support.both_sides import (
     node,
 )
 from support.processes import free_ports, until
-from support.wires import latched
+from support.samples import latched
 
 from tfbus import Buffer, Bus
 from tfbus.links.ros import RosLink

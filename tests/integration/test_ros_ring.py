@@ -17,8 +17,7 @@ pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
 
 from support.processes import free_address, new_domain, until
 from support.rosbridge import rosbridge_server
-from support.samples import moving, static
-from support.wires import latched
+from support.samples import latched, moving, static
 
 from tfbus import Bus
 from tfbus.links.dds import DdsLink

@@ -5,9 +5,8 @@ from collections.abc import Callable, Sequence
 from typing import Unpack
 
 from tfbus import Bus, SimulatedClock, TransformStamped
-from tfbus.links._carrier import SendReport
-from tfbus.links._endpoint import Endpoint
-from tfbus.links._receive_queue import Presence, Received
+from tfbus.links.carrier import Presence, Received, SendReport
+from tfbus.links.endpoint import ForeignEnd
 from tfbus.links.ros import RosOptions
 from tfbus.links.ros.ros_link import RosCarrier, RosMessage
 from tfbus.links.ros.settings import settings_of
@@ -55,18 +54,28 @@ class RosEnd:
         self.heard: list[tuple[TransformStamped, ...]] = []
         self.bus.subscribe(self.heard.append)
         self.carrier = ListCarrier(options)
+        self.endpoint = ForeignEnd(self.bus, "ros", self.carrier)
+        self.endpoint.host = self
         self.errors: list[Exception] = []
         self.report = SendReport(self.errors.append)
-        self.endpoint = Endpoint(self.bus, "ros", self.carrier, lambda: None)
-        self.carrier.connect(self.endpoint.handle, self.report)
+        self.carrier.connect(self.receive, self.report)
         self.endpoint.attach()
+
+    def receive(self, item: Received) -> None:
+        self.endpoint.handle(item.sender, item.content)
+
+    def send_soon(self, pending: int) -> None:
+        """The test ends the turn."""
+
+    def stir(self) -> None:
+        """Nothing is due."""
 
     def hear(self, *samples: TransformStamped, static: bool = False, authority: str = "/node") -> None:
         """A message comes from ROS."""
         self.hear_bytes(encode(samples), static, authority)
 
     def hear_bytes(self, payload: bytes, static: bool = False, authority: str = "/node") -> None:
-        self.endpoint.handle(Received("peer", RosMessage(payload, static, authority), len(payload)))
+        self.carrier.hear(RosMessage(payload, static, authority))
 
     def say(self, *samples: TransformStamped) -> None:
         """The bus publishes, and the turn ends."""

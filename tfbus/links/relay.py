@@ -271,6 +271,9 @@ class Relay:
                 # A subscriber that hears of one removal may have removed or published others, or closed the bus.
                 if not self._bus.closed and latest is not None and latest.peer is peer:
                     self._remove_from_bus(frame, Provenance(self.origin, self._next_number(), outbox, peer))
+                    if self._passed is not None:
+                        # The next peer may bring it just as it was.
+                        self._passed.forget(frame)
         return frames
 
     def say_again(self, frames: Iterable[str]) -> None:

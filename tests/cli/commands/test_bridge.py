@@ -5,8 +5,7 @@ import anyio.to_thread
 import pytest
 from support.commands import Command, check_wrong_call
 from support.processes import free_address, new_domain, start_tfbus, until
-from support.samples import moving, static
-from support.wires import latched
+from support.samples import latched, moving, static
 
 from tfbus import Bus
 

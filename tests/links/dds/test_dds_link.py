@@ -14,8 +14,7 @@ import anyio.to_thread
 import pytest
 from support.processes import until
 from support.ros import named
-from support.samples import moving, static
-from support.wires import latched
+from support.samples import latched, moving, static
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 

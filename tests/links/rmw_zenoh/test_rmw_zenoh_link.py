@@ -22,8 +22,7 @@ from support.both_sides import SECONDS, Node, Program, meet, node
 from support.damage import damaged
 from support.joint_messages import joint_state
 from support.processes import free_ports, until
-from support.samples import moving, static
-from support.wires import latched
+from support.samples import latched, moving, static
 
 from tfbus import SECOND, Buffer, Bus, PeerRejected, SimulatedClock, TransformStamped
 from tfbus.links.rmw_zenoh import RmwZenohLink, rmw_zenoh_link

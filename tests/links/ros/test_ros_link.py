@@ -145,7 +145,7 @@ def test_what_comes_from_ros_has_the_node_as_its_authority_and_the_kind_of_its_t
     assert end.carrier.said == [], "nothing goes back"
     # Nor is an empty message anything.
     end.hear()
-    assert (len(end.heard), end.endpoint.inbox.messages) == (3, 4)
+    assert (len(end.heard), end.endpoint.messages) == (3, 4)
     # An authority may be given.
     end = RosEnd(authority="robot")
     end.hear(moving("map", "base", 5))
@@ -265,7 +265,7 @@ def test_what_ros_gives_back_is_no_news() -> None:
     end.say(moving("map", "base", 1, 5.0), static("map", "lidar", 2.0))
     end.hear(moving("map", "base", 1, 5.0))
     end.hear(static("map", "lidar", 2.0), static=True)
-    assert (len(end.heard), end.endpoint.inbox.duplicates) == (1, 2)
+    assert (len(end.heard), end.endpoint.duplicates) == (1, 2)
     end.hear(static("map", "lidar", 3.0), static=True)
     assert end.heard[1:] == [(static("map", "lidar", 3.0, authority="/node"),)]
 

@@ -36,8 +36,7 @@ from support.both_sides import (
 )
 from support.processes import free_ports, until
 from support.rosbridge import install_roslib, roslib_client
-from support.samples import moving, static
-from support.wires import latched
+from support.samples import latched, moving, static
 
 from tfbus import Buffer, Bus, TransformStamped
 from tfbus.links.rosbridge import RosbridgeLink

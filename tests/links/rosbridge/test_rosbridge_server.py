@@ -19,8 +19,7 @@ pytest.importorskip("trio")
 
 from support import rosbridge
 from support.rosbridge import Joined, rosbridge_server
-from support.samples import moving, static
-from support.wires import latched
+from support.samples import latched, moving, static
 from trio.testing import MockClock
 from wsproto.events import BytesMessage, CloseConnection, Ping, TextMessage
 from wsproto.utilities import LocalProtocolError
