@@ -329,7 +329,7 @@ class PeerLost(PlainData):
     link, peer : str
         As in `PeerJoined`.
     authorities : tuple of str
-        The authorities whose samples came from the peer, sorted.
+        The authorities of the buses that the peer led to, sorted.
     frames : tuple of str
         The frames whose newest sample came from the peer, sorted; a link that drops lost frames removes them.
     """

@@ -1,11 +1,14 @@
 """A process with a bus and its links that reads commands as lines of JSON, and writes its answers as such lines.
 
-Its only argument is JSON too: ``{"backend": .., "links": [{"domain": .., ..}, ..]}``, with the arguments of each link.
+Its only argument is JSON too: ``{"backend": .., "links": [{"domain": .., ..}, ..]}``, with the arguments of each link:
+of a `ZenohLink` if it has an address, else of a `LocalLink`. With ``"keeps": true`` it keeps all that it hears.
 A line ``{"id": 7, "do": "publish", ..}`` is answered by ``{"id": 7, ..}`` when it is done; what happens on the bus
 comes by itself, as ``{"event": "PeerLost", ..}``. It ends at the end of its input.
 """
 
 import json
+import os
+import resource
 import sys
 import time
 from collections import defaultdict
@@ -20,6 +23,7 @@ import anyio.lowlevel
 from tfbus import (
     Buffer,
     Bus,
+    LocalLink,
     PeerJoined,
     PeerLost,
     PeerRejected,
@@ -30,7 +34,7 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.geometry.stamped import Batch
-from tfbus.links.zenoh import ZenohLink
+from tfbus.links import DomainLink
 
 _PROBE = 0.01
 
@@ -66,7 +70,7 @@ class Tally:
 
 
 class Program:
-    def __init__(self, bus: Bus, links: list[ZenohLink]) -> None:
+    def __init__(self, bus: Bus, links: list[DomainLink], keeps: bool) -> None:
         self.bus = bus
         self.links = links
         self.buffer = Buffer(bus, keep=None)
@@ -75,6 +79,7 @@ class Program:
         self.moving: set[str] = set()
         self.x: dict[str, float] = {}
         self.longest_pause = 0.0
+        self.heard: list[tuple[Any, ...]] | None = [] if keeps else None
         self._changed = anyio.Event()
         bus.subscribe(self._arrived, self._removed)
 
@@ -85,13 +90,19 @@ class Program:
             new.add(sample.child)
             old.discard(sample.child)
             self.x[sample.child] = sample.transform.translation[0]
+            self._keep("sample", sample.child, sample.static, sample.stamp, sample.transform.translation[0])
         self._changed.set()
 
     def _removed(self, frame: str) -> None:
         self.static.discard(frame)
         self.moving.discard(frame)
         self.x.pop(frame, None)
+        self._keep("removal", frame)
         self._changed.set()
+
+    def _keep(self, *fact: Any) -> None:
+        if self.heard is not None:
+            self.heard.append(fact)
 
     async def tell_events(self) -> None:
         with self.bus.events(stale_after=None) as events:
@@ -99,8 +110,10 @@ class Program:
                 match event:
                     case PeerJoined(link=link, peer=peer):
                         tell(event="PeerJoined", link=link, peer=peer)
+                        self._keep("joined", peer)
                     case PeerLost(link=link, peer=peer, authorities=authorities, frames=frames):
                         tell(event="PeerLost", link=link, peer=peer, authorities=authorities, frames=frames)
+                        self._keep("lost", peer)
                     case PeerRejected(peer=peer, reason=reason):
                         tell(event="PeerRejected", peer=peer, reason=reason)
                 self._changed.set()
@@ -199,6 +212,23 @@ class Program:
         """Keep the event loop busy."""
         time.sleep(seconds)  # noqa: ASYNC251 - that is what is asked for
 
+    async def do_heard(self, since: int) -> dict[str, Any]:
+        """All that was heard since then."""
+        assert self.heard is not None
+        return {"heard": self.heard[since:]}
+
+    async def do_fill_file_table(self, seconds: float) -> None:
+        """Have no file left to open for a while."""
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 256), hard))
+        files = []
+        with suppress(OSError):
+            while True:
+                files.append(os.open(os.devnull, os.O_RDONLY))
+        await anyio.sleep(seconds)
+        for file in files:
+            os.close(file)
+
     async def do_stamp(self, authority: str, messages: int, rate: float) -> None:
         """Publish single samples, each with the time of the machine's steady clock as its stamp."""
         began = time.monotonic()
@@ -244,10 +274,18 @@ def as_sample(
     return TransformStamped(parent, child, stamp, Transform((x, 0.0, 0.0)), authority, static)
 
 
-async def main(links: list[dict[str, Any]]) -> None:
+def link_of(bus: Bus, options: dict[str, Any]) -> DomainLink:
+    if not {"connect", "listen"} & options.keys():
+        return LocalLink(bus, **options)
+    from tfbus.links.zenoh import ZenohLink
+
+    return ZenohLink(bus, **options)
+
+
+async def main(links: list[dict[str, Any]], keeps: bool) -> None:
     with Bus(SystemClock()) as bus:
         async with AsyncExitStack() as stack:
-            program = Program(bus, [ZenohLink(bus, **options) for options in links])
+            program = Program(bus, [link_of(bus, options) for options in links], keeps)
             tasks = await stack.enter_async_context(anyio.create_task_group())
             tasks.start_soon(program.tell_events)
             tasks.start_soon(program.watch_pauses)
@@ -264,4 +302,5 @@ async def main(links: list[dict[str, Any]]) -> None:
 if __name__ == "__main__":
     arguments = json.loads(sys.argv[1])
     backend, _, loop = arguments["backend"].partition("+")
-    anyio.run(main, arguments["links"], backend=backend, backend_options={"use_uvloop": True} if loop else {})
+    keeps = arguments.get("keeps", False)
+    anyio.run(main, arguments["links"], keeps, backend=backend, backend_options={"use_uvloop": True} if loop else {})

@@ -51,8 +51,11 @@ def new_domain() -> str:
 class PeerProcess:
     """One such process; its output is kept until a test asks for it."""
 
-    def __init__(self, *links: dict[str, Any], backend: str = "asyncio", prefix: tuple[str, ...] = ()) -> None:
-        command = [*prefix, sys.executable, str(_PROGRAM), json.dumps({"backend": backend, "links": links})]
+    def __init__(
+        self, *links: dict[str, Any], backend: str = "asyncio", prefix: tuple[str, ...] = (), keeps: bool = False
+    ) -> None:
+        arguments = {"backend": backend, "links": links, "keeps": keeps}
+        command = [*prefix, sys.executable, str(_PROGRAM), json.dumps(arguments)]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
@@ -159,15 +162,15 @@ class Crowd:
     def __init__(self) -> None:
         self.members: list[PeerProcess] = []
 
-    def add(self, *links: dict[str, Any], backend: str = "asyncio", prefix: tuple[str, ...] = ()) -> PeerProcess:
+    def add(self, *links: dict[str, Any], **how: Any) -> PeerProcess:
         """Start a process, and wait until its links are open."""
-        process = self.begin(*links, backend=backend, prefix=prefix)
+        process = self.begin(*links, **how)
         process.wait(event="ready")
         return process
 
-    def begin(self, *links: dict[str, Any], backend: str = "asyncio", prefix: tuple[str, ...] = ()) -> PeerProcess:
-        """Start a process."""
-        process = PeerProcess(*links, backend=backend, prefix=prefix)
+    def begin(self, *links: dict[str, Any], **how: Any) -> PeerProcess:
+        """Start a process, as a `PeerProcess` says."""
+        process = PeerProcess(*links, **how)
         self.members.append(process)
         return process
 

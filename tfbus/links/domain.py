@@ -393,7 +393,9 @@ class DomainEnd(Endpoint):
                 size = len(entry.samples)
                 if not self._admit_number(peer, entry.sequence, size):
                     continue
-                if not self.peers.admit_authorities(peer, entry.authorities, size):
+                # What an answer tells of buses that the peer does not lead to is not the peer's.
+                others = entry.origin not in peer.paths
+                if not others and not self.peers.admit_authorities(peer, entry.authorities, size):
                     continue
                 provenance = Provenance(entry.origin, entry.sequence, self.outbox, peer)
                 samples = self._note(replica, provenance, entry.samples, live)
