@@ -364,6 +364,7 @@ class DomainEnd(Endpoint):
         live = heard.kind is Kind.LIVE
         if not heard.continues and (live or heard.kind is Kind.SIGN) and self._count_gap(peer, heard.number, live):
             self._agreement.missed(peer.id, now)
+            self.host.stir()
         if heard.kind is Kind.PAST:
             self._take_past(peer, heard)
             return
@@ -377,7 +378,7 @@ class DomainEnd(Endpoint):
         elif not heard.goes_on and not live:
             is_much = heard.kind is Kind.MEETING and not heard.continues and not heard.entries
             self._agreement.told(peer.id, heard.claim, now, soon=is_much)
-        if not live or heard.number:
+        if not live:
             self.host.stir()
 
     def _take_entries(self, peer: Peer, heard: Heard, live: bool) -> bool:

@@ -33,6 +33,7 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.outbox import OutgoingBatch, RemovedFrame
 from tfbus.links.relay import ReceivedBatch, ReceivedTransform
 from tfbus.links.replica import Claim
+from tfbus.stamps import SECOND
 from tfbus.tf_message import MAX_NAME, MIN_SIZE, MalformedMessageError, decode, decode_in_parts, encode, refusal
 
 VERSION = 3
@@ -53,6 +54,10 @@ _PART = 200
 """So many samples, or entries, of a large message are decoded, or handled, before other tasks may have their turn."""
 _PART_OF_HEAD = 1_000
 _LONGEST_AUTHORITY = 65_535
+_FIRST_STAMP, _END_OF_STAMPS = -(2**31) * SECOND, 2**31 * SECOND
+_HELD: set[tuple[str, str, str]] = set()
+"""The parents, children and authorities that a message can hold, as far as it was asked of late."""
+_MOST_HELD = 2_000
 
 _HEADER = struct.Struct("<BBBBHHIQ16sQQQ")
 _ENTRY = struct.Struct("<BHHQ")
@@ -186,7 +191,18 @@ def write_body(kind: Kind, body: bytes) -> bytes:
 
 def can_hold(sample: TransformStamped) -> bool:
     """Whether a message can hold a sample."""
-    return reason_not_to_send(sample) is None
+    parent, child, stamp, _, authority, _ = sample._fields
+    # The same names come again with each sample of a frame.
+    names = parent, child, authority
+    if names in _HELD:
+        return _FIRST_STAMP <= stamp < _END_OF_STAMPS
+    if reason_not_to_send(sample) is not None:
+        return False
+    if len(_HELD) >= _MOST_HELD:
+        _HELD.clear()
+    if len(authority) < _MOST_HELD:
+        _HELD.add(names)
+    return True
 
 
 def reason_not_to_send(sample: TransformStamped) -> InvalidTransformError | None:

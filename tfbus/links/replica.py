@@ -207,6 +207,11 @@ class Replica:
         known = self.entries.get(frame)
         if known is not None and number <= known.number and not self._replaces(rank, sample, known):
             return False
+        if settles and known is not None and known.sample is not None and known.origin == origin:
+            # A frame that goes on moving.
+            self.entries[frame] = Entry(number, origin, sample, ours)
+            self._fresh[frame] = None
+            return True
         was_removed = known is not None and known.sample is None
         if known is None or known.origin != origin or was_removed is not (sample is None):
             self._count(origin, known, sample)
