@@ -6,11 +6,11 @@ from contextlib import contextmanager
 import pytest
 from support.samples import moving, static
 from support.wires import Domain, ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld, WireCarrier, latched
-
-from tfbus import Bus, SimulatedClock, TransformStamped
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._endpoint import Endpoint
 from tfbus.links.zenoh._carrier import ZenohCarrier
+
+from tfbus import Bus, SimulatedClock, TransformStamped
 
 Batch = tuple[TransformStamped, ...]
 CARRIERS: list[type[Carrier]] = [ForeignCarrier, WireCarrier, ZenohCarrier]

@@ -9,9 +9,6 @@ import pytest
 from support import wires
 from support.samples import moving, static
 from support.wires import Domain, ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
-
-from tfbus import Bus, Event, SimulatedClock
-from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.links._asker import FIRST_PAUSE, PATIENCE, SETTLING
 from tfbus.links._endpoint import CLAIM_PERIOD, Endpoint
 from tfbus.links._entries import OutgoingBatch
@@ -20,6 +17,9 @@ from tfbus.links._outbox import Turn
 from tfbus.links._peers import MAX_PEERS
 from tfbus.links._receive_queue import Answer, HistoryAnswer, Presence, Question, Received
 from tfbus.links._state import StateStep
+
+from tfbus import Bus, Event, SimulatedClock
+from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.tf_message import MalformedMessageError
 
 

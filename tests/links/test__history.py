@@ -5,9 +5,6 @@ from contextlib import contextmanager
 import pytest
 from support.samples import moving, static
 from support.wires import Domain, End
-
-from tfbus import SECOND, Buffer, Bus, TransformStamped
-from tfbus.links import _history
 from tfbus.links._history import (
     CHUNK,
     LONGEST_HISTORY,
@@ -21,6 +18,9 @@ from tfbus.links._history import (
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import HistoryAnswer, HistoryQuestion
 from tfbus.links._state import StateStep
+
+from tfbus import SECOND, Buffer, Bus, TransformStamped
+from tfbus.links import _history
 from tfbus.links.zenoh import ZenohLink
 
 

@@ -13,6 +13,17 @@ from hypothesis import strategies as st
 from support import strategies as some
 from support.samples import moving, static
 from support.wires import Domain, End, size_of
+from tfbus.links._attachment import MAX_ENTRIES, Entry, PublishedBatch, pack
+from tfbus.links._entries import MovingFrame, RemovedFrame
+from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
+from tfbus.links._message import Message, read_message
+from tfbus.links._mirror import Mirror
+from tfbus.links._outbox import Outbox
+from tfbus.links._peers import MAX_AUTHORITIES, MAX_PEERS
+from tfbus.links._provenance import ReceivedTransform
+from tfbus.links._receive_queue import Presence
+from tfbus.links._relay import LARGEST_JUMP, Relay
+from tfbus.links._state import StateStep, digest_moving
 
 from tfbus import (
     Buffer,
@@ -27,17 +38,6 @@ from tfbus import (
     TransformStamped,
 )
 from tfbus.bus.ownership import OnConflict
-from tfbus.links._attachment import MAX_ENTRIES, Entry, PublishedBatch, pack
-from tfbus.links._entries import MovingFrame, RemovedFrame
-from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
-from tfbus.links._message import Message, read_message
-from tfbus.links._mirror import Mirror
-from tfbus.links._outbox import Outbox
-from tfbus.links._peers import MAX_AUTHORITIES, MAX_PEERS
-from tfbus.links._provenance import ReceivedTransform
-from tfbus.links._receive_queue import Presence
-from tfbus.links._relay import LARGEST_JUMP, Relay
-from tfbus.links._state import StateStep, digest_moving
 from tfbus.tf_message import encode
 
 ORIGIN, OTHER = b"0123456789abcdef", b"another origin !"

@@ -3,10 +3,10 @@ from collections.abc import Callable
 from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import moving, static
-
-from tfbus import TransformStamped
 from tfbus.links._entries import OutgoingBatch, RemovedFrame
 from tfbus.links._outbox import Outbox
+
+from tfbus import TransformStamped
 
 ORIGIN, OTHER = b"0123456789abcdef", b"another origin !"
 Kept = dict[str, tuple[TransformStamped, ...] | RemovedFrame | None]

@@ -1,7 +1,5 @@
 import pytest
 from support.samples import moving, static
-
-from tfbus import TransformStamped
 from tfbus.links._carrier import SendReport
 from tfbus.links._entries import OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
@@ -9,6 +7,8 @@ from tfbus.links._message import Message, read_message
 from tfbus.links._outbox import Turn
 from tfbus.links._part_writer import PartWriter
 from tfbus.links._state import StateStep
+
+from tfbus import TransformStamped
 
 ORIGIN = b"0123456789abcdef"
 CHANGED = StateStep(3, 5, 99)

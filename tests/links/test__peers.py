@@ -1,5 +1,4 @@
 import pytest
-
 from tfbus.links._mirror import Mirror
 from tfbus.links._peers import MAX_PEERS, Peer, Peers
 

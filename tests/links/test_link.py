@@ -12,15 +12,15 @@ import pytest
 from support.processes import until
 from support.samples import moving, static
 from support.wires import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld, WireCarrier
-
-from tfbus import Bus, BusClosedError, PeerJoined, PeerLost, PeerRejected, SimulatedClock
-from tfbus.links import Link, _endpoint
 from tfbus.links._carrier import SendReport
 from tfbus.links._entries import OutgoingBatch
 from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._message import MAX_SAMPLES, MessageWriter, read_message_in_parts
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
+
+from tfbus import Bus, BusClosedError, PeerJoined, PeerLost, PeerRejected, SimulatedClock
+from tfbus.links import Link, _endpoint
 from tfbus.tf_message import MalformedMessageError
 
 pytestmark = pytest.mark.anyio

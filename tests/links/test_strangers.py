@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import strategies as some
-from support.domains import Network, Process, Stranger, World
+from support.domains import Network, Stranger, World
 from support.samples import moving, static
 
 from tfbus import PeerLost, PeerRejected, TransformStamped

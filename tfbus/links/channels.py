@@ -7,6 +7,7 @@ its messages have no numbers. What nobody hears is not written, but numbered.
 """
 
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 from typing import Final
 
 from tfbus.links.carrier import SendReport
@@ -22,6 +23,7 @@ from tfbus.links.message import (
     write_message,
 )
 from tfbus.links.outbox import OutgoingBatch, RemovedFrame, Turn
+from tfbus.links.peers import MAX_PEERS
 from tfbus.links.replica import Claim, Replica
 from tfbus.links.wire import Wire
 
@@ -91,21 +93,25 @@ class Channels:
         self._partial = partial
         self._all = _Channel(ALL, None, 0.0)
         self._filters: dict[str, _Channel] = {}
+        # The names of filters beyond the bound.
+        self._whole: dict[str, None] = {}
         self._newest: dict[str, OutgoingBatch] = {}
         self._time: int | None = None
         self.report: SendReport
 
-    def serve(self, frames: frozenset[str], now: float) -> bool:
-        """Publish a filter from now on, in place of one that nobody hears if there are many; False if all are heard."""
+    def serve(self, frames: frozenset[str], now: float) -> None:
+        """Publish a filter from now on; beyond `MOST_FILTERS` everything goes to those that hear it."""
         name = filter_name(frames)
-        if name not in self._filters and name != ALL:
-            if len(self._filters) >= MOST_FILTERS:
-                unheard = next((each for each in self._filters if not self._wire.is_heard(each)), None)
-                if unheard is None:
-                    return False
-                del self._filters[unheard]
+        if name in self._filters or name == ALL:
+            return
+        if len(self._filters) < MOST_FILTERS:
             self._filters[name] = _Channel(name, frames, now)
-        return True
+        elif name not in self._whole:
+            unheard = [each for each in self._whole if not self._wire.is_heard(each)]
+            for each in unheard:
+                del self._whole[each]
+            if len(self._whole) < MAX_PEERS:
+                self._whole[name] = None
 
     def send(self, turn: Turn, now: float) -> None:
         """Publish what one turn has gathered."""
@@ -130,6 +136,11 @@ class Channels:
                 claim = replica.claim(now, channel.frames)._replace(partial=self._partial)
                 sign = Outgoing(Kind.SIGN, self._bus, channel.number, claim, self._time, reach, serves)
                 self._wire.publish(channel.name, write_message(sign))
+                if channel is self._all and self._whole:
+                    # A copy of some frames is not to be compared with that of all.
+                    sign = replace(sign, claim=claim._replace(partial=True))
+                    for name in self._whole:
+                        self._wire.publish(name, write_message(sign))
 
     def send_slowly(self) -> None:
         """Publish the newest sample of each moving frame that was sent since this was called last."""
@@ -141,7 +152,7 @@ class Channels:
             self._write(_Channel(SLOW, None, 0.0), batches[first : first + _PER_MESSAGE])
 
     def _is_heard(self, channel: _Channel, now: float) -> bool:
-        if self._wire.is_heard(channel.name):
+        if self._wire.is_heard(channel.name) or (channel is self._all and any(map(self._wire.is_heard, self._whole))):
             channel.heard_at = now
             return True
         if channel.frames is not None and now - channel.heard_at > _FORGOTTEN:
@@ -183,6 +194,9 @@ class Channels:
         else:
             channel.number = number
             self._wire.publish(channel.name, message)
+            if channel is self._all:
+                for name in self._whole:
+                    self._wire.publish(name, message)
             self.report.sent(sum(map(size_of, entries)))
             return
         sendable = [kept for kept in map(self._sendable, entries) if kept is not None]

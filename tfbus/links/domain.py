@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import nullcontext
-from fnmatch import fnmatchcase
 from math import inf
 from time import monotonic
 from typing import Any, NamedTuple
@@ -177,7 +176,7 @@ class DomainEnd(Endpoint):
     # For the link
 
     async def open(self) -> None:
-        await self._wire.open(self._hearings(), self.take, self.report.failed)
+        await self._wire.open(self._hearings(), self.take, self._warn_of_wire)
 
     async def run(self) -> None:
         await self._wire.run()
@@ -227,6 +226,9 @@ class DomainEnd(Endpoint):
 
     def split(self, item: Received) -> Iterator[Any]:
         return read_message(item.content) if isinstance(item.content, bytes) else iter((item.content,))
+
+    def _warn_of_wire(self, error: Exception) -> None:
+        self._log.warning(str(error), "the link %s: %s", self.name, error)
 
     # For its parts
 
@@ -588,9 +590,7 @@ class DomainEnd(Endpoint):
             if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
                 raise MalformedMessageError("text", "a filter without names")
             frames = frozenset(names)
-            if not self._channels.serve(frames, self._now()):
-                error = ValueError("too many different filters to serve")
-                self.peers.reject(sender, "too many filters", error)
+            self._channels.serve(frames, self._now())
         limit = CHUNK
         while limit:
             entries, claim = self.own.changes(since, self._now(), frames, limit)
@@ -672,7 +672,8 @@ class DomainEnd(Endpoint):
         return [Hearing(robots, channels.get(rate, SLOW)) for robots, rate in self._robots.items()]
 
     def _rate_of(self, robot: str) -> float:
-        return next((rate for robots, rate in self._robots.items() if fnmatchcase(robot, robots)), inf)
+        hearings = zip(self._hearings(), self._robots.values(), strict=True)
+        return next((rate for hearing, rate in hearings if hearing.matches(robot)), inf)
 
 
 class _Due(NamedTuple):

@@ -30,6 +30,23 @@ class Hearing(NamedTuple):
     robots: str
     channel: str
 
+    def matches(self, robot: str) -> bool:
+        """Whether a robot has a name of the pattern; in linear time, for strangers choose the names."""
+        first, *others = self.robots.split("*")
+        if not others:
+            return robot == first
+        last = others.pop()
+        if len(robot) < len(first) + len(last) or not robot.startswith(first) or not robot.endswith(last):
+            return False
+        at, end = len(first), len(robot) - len(last)
+        for part in others:
+            # Each part may stand where it first occurs, so nothing is ever tried again.
+            at = robot.find(part, at, end)
+            if at < 0:
+                return False
+            at += len(part)
+        return True
+
 
 @dataclass(frozen=True, slots=True)
 class Joined:
@@ -63,7 +80,7 @@ class Wire(Protocol):
     id: str
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
-        """Connect to the network.
+        """Join the network, or begin to: where others are not there yet, `run` meets them later.
 
         Parameters
         ----------
@@ -74,14 +91,16 @@ class Wire(Protocol):
             Takes the id of a link, and what has come of it: that it has joined or left, a message that it has published
             on a channel which this link hears, or one that it has sent to this link. Messages that are sent to this
             link come from all links of the domain, announced or not. Any thread may call it, from now until `close`
-            has returned and later; it never blocks and never raises. Items of one link come in their order.
+            has returned and later; it never blocks and never raises. What one link has published comes in its order,
+            and so does what it has sent.
         warn : callable
             Takes an error of the network that the user should know; for the event loop only. It never raises.
 
         Raises
         ------
         OSError
-            If there is no network. Whatever it raises, also when it is cancelled, the link calls `close` next.
+            If there can be no network: an address is taken, or a directory is open to others. Whatever it raises, also
+            when it is cancelled, the link calls `close` next.
         """
 
     async def run(self) -> None:
@@ -100,7 +119,8 @@ class Wire(Protocol):
     def send(self, link: str, message: bytes) -> bool:
         """Send a message to one link of the domain; it does not block and does not raise.
 
-        It goes before published messages that wait for room. It may be lost like these.
+        Where the network has an order for it, it goes before published messages that wait for room. It may be lost like
+        these.
 
         Returns
         -------

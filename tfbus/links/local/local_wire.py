@@ -392,7 +392,7 @@ class LocalWire(Wire):
         if connection.hello is None:
             connection.hello = Hello.write(self._domain, self.id, self._robot)
             connection.send(frame_of(connection.hello.content))
-        connection.heard = channel_for(theirs.robot, self._hears)
+        connection.heard = next((one.channel for one in self._hears if one.matches(theirs.robot)), None)
         connection.send(frame_of(connection.write_welcome()))
 
     def _join(self, connection: Connection, theirs: Hello) -> None:
@@ -420,28 +420,6 @@ class LocalWire(Wire):
             connection.abandon()
         self._poll.abandon()
         self._forget()
-
-
-def channel_for(robot: str, hears: Sequence[Hearing]) -> str | None:
-    """The channel of the first pattern that matches a robot."""
-    return next((hearing.channel for hearing in hears if matches(robot, hearing.robots)), None)
-
-
-def matches(robot: str, pattern: str) -> bool:
-    """Whether a robot has a name of a pattern, in which ``*`` stands for any letters; in linear time."""
-    first, *others = pattern.split("*")
-    if not others:
-        return robot == pattern
-    last = others.pop()
-    if len(robot) < len(first) + len(last) or not robot.startswith(first) or not robot.endswith(last):
-        return False
-    at, end = len(first), len(robot) - len(last)
-    for part in others:
-        at = robot.find(part, at, end)
-        if at < 0:
-            return False
-        at += len(part)
-    return True
 
 
 _open_wires: WeakSet[LocalWire] = WeakSet()

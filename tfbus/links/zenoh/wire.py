@@ -73,8 +73,6 @@ _TOKEN = re.compile(
     rf"(?P<robot>~|[\w.-]{{1,{LONGEST_NAME}}})/@alive/(?P<link>[0-9a-f]{{32}})/(?P<number>[1-9]\d{{0,8}})", re.ASCII
 )
 _DROP, _REMOTE = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE
-_Heard = tuple[str, re.Pattern[str], str]
-"""A `Hearing`: the robots as an expression of zenoh and as a regular one, and the channel."""
 
 
 class ZenohWire:
@@ -146,7 +144,7 @@ class ZenohWire:
         RuntimeError
             If this process was forked from one that uses zenoh.
         """
-        self._hears = [(robots_expression(robots), robots_pattern(robots), channel) for robots, channel in hears]
+        self._hears = tuple(hears)
         self._receive, self._warn = receive, warn
         self._tried = anyio.Event()
         self._waker = LoopWaker(self._tell)
@@ -273,21 +271,22 @@ class _Session:
     def channels(self) -> list[str]:
         return list(self._publishers)
 
-    def begin(self, domain: str, number: int, hears: Sequence[_Heard], *, breaks: bool) -> None:
+    def begin(self, domain: str, number: int, hears: Sequence[Hearing], *, breaks: bool) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
         session, hearer, declared = self._session, self.hearer, self._declared
         if breaks:
             declared.append(session.info.declare_transport_events_listener(_directly(hearer.take_event)))
-        for index, (robots, _, channel) in enumerate(hears):
+        for index, (robots, channel) in enumerate(hears):
             take = _directly(partial(hearer.take_published, index))
-            key = f"{domain}/{robots}/{channel}/*"
+            key = f"{domain}/{robots_expression(robots)}/{channel}/*"
             declared.append(session.declare_subscriber(key, take, allowed_origin=_REMOTE))
         take = _directly(hearer.take_sent)
         declared.append(session.declare_subscriber(f"{domain}/@to/{self._link}", take, allowed_origin=_REMOTE))
         liveliness = session.liveliness()
-        for index, (robots, _, _) in enumerate(hears):
+        for index, (robots, _) in enumerate(hears):
             take = _directly(partial(hearer.take_token, index))
-            declared.append(liveliness.declare_subscriber(f"{domain}/{robots}/@alive/*/*", take, history=True))
+            key = f"{domain}/{robots_expression(robots)}/@alive/*/*"
+            declared.append(liveliness.declare_subscriber(key, take, history=True))
         declared.append(liveliness.declare_token(f"{self._own}/@alive/{self._link}/{number}"))
         if breaks and not session.info.transports():
             # It broke before anybody listened.
@@ -342,12 +341,12 @@ class _Hearer:
     """Takes all that comes by one session, in zenoh's threads; it holds none of zenoh's objects, which hold it."""
 
     def __init__(
-        self, link: str, domain: str, hears: Sequence[_Heard], receive: Receive, changed: threading.Event
+        self, link: str, domain: str, hears: Sequence[Hearing], receive: Receive, changed: threading.Event
     ) -> None:
         self.broken = False
         self._link = link
         self._rest = len(domain) + 1
-        self._patterns = [pattern for _, pattern, _ in hears]
+        self._hears = hears
         self._receive = receive
         self._changed = changed
         self._lock = threading.Lock()
@@ -379,7 +378,7 @@ class _Hearer:
             return
         link, number = found["link"], int(found["number"])
         robot = found["robot"] if found["robot"] != NO_ROBOT else ""
-        if index != next((place for place, pattern in enumerate(self._patterns) if pattern.fullmatch(robot)), None):
+        if index != next((place for place, one in enumerate(self._hears) if one.matches(robot)), None):
             return
         with self._lock:
             known = self._present.get(link)
@@ -436,12 +435,3 @@ def robots_expression(robots: str) -> str:
         return NO_ROBOT
     collapsed = re.sub(r"\*+", "*", robots)
     return collapsed if collapsed == "*" else collapsed.replace("*", "$*")
-
-
-def robots_pattern(robots: str) -> re.Pattern[str]:
-    """The same as a regular expression, which takes no longer for the names that strangers choose."""
-    first, *rest = map(re.escape, robots.split("*"))
-    if not rest:
-        return re.compile(first)
-    # Each part may stand where it first occurs, so nothing is ever tried again.
-    return re.compile(first + "".join(f"(?>.*?{part})" for part in rest[:-1]) + f".*{rest[-1]}")
