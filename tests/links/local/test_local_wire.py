@@ -80,7 +80,7 @@ async def test_a_link_hears_the_channel_of_the_first_pattern_that_fits_and_of_ot
 ) -> None:
     hearing = [Hearing("arm*", "few"), Hearing("a*", "all")]
     async with AsyncExitStack() as stack:
-        wires = {robot: LocalWire(DOMAIN, robot, directory=directory) for robot in ("arm 1", "ant", "bee")}
+        wires = {robot: LocalWire(DOMAIN, robot, directory=directory) for robot in ("arm-1", "ant", "bee")}
         ears = {robot: await stack.enter_async_context(running(wire)) for robot, wire in wires.items()}
         listener = LocalWire(DOMAIN, directory=directory)
         ear = await stack.enter_async_context(running(listener, hearing))
@@ -92,10 +92,10 @@ async def test_a_link_hears_the_channel_of_the_first_pattern_that_fits_and_of_ot
                 wire.publish(channel, channel.encode())
             assert wire.send(listener.id, b"sent")
         await ear.until(lambda: all(b"sent" in ear.messages(wire.id) for wire in wires.values()))
-        assert told == {"arm 1": [True, True], "ant": [False, True], "bee": [False, True]}
+        assert told == {"arm-1": [True, True], "ant": [False, True], "bee": [False, True]}
         heard = {robot: ear.messages(wire.id) for robot, wire in wires.items()}
-        assert heard == {"arm 1": [b"few", b"sent"], "ant": [b"all", b"sent"], "bee": [b"sent"]}
-        assert set(ear.present()) == {wires["arm 1"].id, wires["ant"].id}
+        assert heard == {"arm-1": [b"few", b"sent"], "ant": [b"all", b"sent"], "bee": [b"sent"]}
+        assert set(ear.present()) == {wires["arm-1"].id, wires["ant"].id}
 
 
 @pytest.mark.parametrize(
