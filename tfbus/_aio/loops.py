@@ -11,6 +11,7 @@ import logging
 import threading
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import Context, copy_context
 from time import monotonic
 from typing import Any, cast
 
@@ -39,6 +40,7 @@ class LoopWaker:
         self._callback = callback
         self._call_soon: Callable[[Callable[[], object]], object] | None = None
         self._loop_is_closed: Callable[[], bool] = _never
+        self._context: Context
         self._requested = False
 
     @property
@@ -53,6 +55,7 @@ class LoopWaker:
         self._call_soon = getattr(native, "run_sync_soon", None) or native.call_soon_threadsafe
         # trio answers each request that it has accepted. An asyncio loop may be closed with requests left.
         self._loop_is_closed = getattr(native, "is_closed", _never)
+        self._context = copy_context()
         # An earlier loop may have ended without answering a request.
         self._requested = False
 
@@ -79,7 +82,8 @@ class LoopWaker:
     def _call(self) -> None:
         self._requested = False
         try:
-            self._callback()
+            # That of a task: a thread's own does not tell anyio which loop runs, so no task could be started.
+            self._context.run(self._callback)
         except Exception:
             # No task would hear of it, and it would end the whole run of trio.
             logging.getLogger("tfbus").exception("a callback of another thread raised")
