@@ -148,7 +148,7 @@ def removals_beyond_the_bound(scene: Scene) -> Iterator[bytes]:
     yield live(RemovedFrame(BUS, scene.number + 1, "gone"))
     for first in range(2, 12_002, 4_000):
         yield live(*(RemovedFrame(BUS, scene.number + first + k, f"r{first + k}") for k in range(4_000)))
-    yield live(kind=Kind.SIGN)
+    yield write_text(Kind.QUESTION, {"since": 0})
 
 
 def many_origins(scene: Scene) -> Iterator[bytes]:
@@ -359,4 +359,6 @@ async def test_whatever_a_stranger_says_the_others_agree_and_what_is_refused_is_
     told = [(event.peer, event.reason) for event in refused]
     assert len(told) == len(set(told))
     assert reasons <= {reason for _, reason in told}
+    # Every refusal has a reason of its own.
+    assert "not published" not in {reason for _, reason in told}
     assert [record for record in caplog.records if record.levelname in ("ERROR", "CRITICAL")] == []
