@@ -4,27 +4,36 @@ import json
 import struct
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from random import Random
 from typing import Any, NamedTuple
 
 import anyio
+import anyio.lowlevel
 import anyio.to_thread
 import pytest
 from support.local_links import RawPeer, files_in, framed
+from support.memory_wire import MemoryNetwork
 from support.processes import free_address, new_domain, until
 from support.samples import moving, static
 
 from tfbus import LATEST, Buffer, Bus, PeerRejected
 from tfbus.links import BufferServer, DomainLink
+from tfbus.links.channels import MOST_FILTERS
+from tfbus.links.domain import SOONEST_SIGN
+from tfbus.links.history import MOST_HELD_SAMPLES, HistoryAsker
 from tfbus.links.local import LocalLink
-from tfbus.links.message import Entry, Kind, Outgoing, write_body, write_message, write_text
+from tfbus.links.message import NOTHING, Entry, Heard, Kind, Outgoing, kind_of, write_body, write_message, write_text
 from tfbus.links.outbox import OutgoingBatch, RemovedFrame
+from tfbus.links.peers import MAX_PEERS, MOST_AUTHORITY_TEXT, Peers
+from tfbus.links.relay import ReceivedBatch
 from tfbus.links.remote_lookup import Cancellation, RemoteQuestion, write_question
-from tfbus.links.replica import Claim
+from tfbus.links.replica import MANY_ORIGINS, MOST_REMOVALS, SETTLING, Claim, Places, Replica, TooManyEntriesError
+from tfbus.links.wire import Hearing, Joined, Left
 
 pytestmark = pytest.mark.anyio
 
+STRANGER = "5" * 32
 BUS, OTHER, FAR = b"stranger........", b"another.........", 2**52
 EXTREMES = [0, 1, 2**7, 2**15, 2**16 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1]
 HEAD = struct.Struct("<BBBBHHIQ16sQQQ")
@@ -254,7 +263,7 @@ class ZenohStranger:
         del directory
         self._domain, self._address = domain, free_address()
         self._attacked: DomainLink | None = None
-        self._id = "5" * 32
+        self._id = STRANGER
 
     def link(self, bus: Bus, **options: Any) -> DomainLink:
         from tfbus.links.zenoh import ZenohLink
@@ -362,3 +371,132 @@ async def test_whatever_a_stranger_says_the_others_agree_and_what_is_refused_is_
     # Every refusal has a reason of its own.
     assert "not published" not in {reason for _, reason in told}
     assert [record for record in caplog.records if record.levelname in ("ERROR", "CRITICAL")] == []
+
+
+# Defects that were found
+
+
+def test_a_removal_that_is_pushed_out_before_its_frame_has_settled_does_no_harm() -> None:
+    replica = Replica(10, OTHER)
+    replica.note("gone", (1, BUS), moving("map", "gone", 1), settles=True)
+    replica.claim(0.0)
+    replica.note("gone", (2, BUS), None)
+    for number in range(MOST_REMOVALS):
+        replica.note(f"r{number}", (3 + number, BUS), None)
+    replica.claim(SETTLING)
+    assert "gone" not in replica.entries
+    assert len(replica.entries) == MOST_REMOVALS
+
+
+@pytest.mark.thorough
+def test_all_copies_of_a_link_together_have_so_many_frames_and_removals() -> None:
+    places = Places(10)
+    copies = [Replica(10, b"own", places) for _ in range(50)]
+    taken = 0
+    for number, copy in enumerate(copies):
+        for k in range(8):
+            with suppress(TooManyEntriesError):
+                taken += copy.note(f"f{k}", (1, number.to_bytes(16, "big")), static("map", f"f{k}"))
+        for k in range(MOST_REMOVALS):
+            copy.note(f"r{k}", (k, BUS), None)
+    assert taken == MANY_ORIGINS * 10
+    assert sum(len(copy.entries) for copy in copies) <= taken + MANY_ORIGINS * MOST_REMOVALS
+    # A copy that is forgotten makes room.
+    for copy in copies:
+        copy.forget()
+    assert copies[0].note("f", (1, BUS), static("map", "f"))
+
+
+def test_messages_of_large_batches_do_not_wait_for_the_past_beyond_a_bound() -> None:
+    asker = HistoryAsker(5.0, lambda *_: None, lambda: 0.0)
+    asker.joined("one")
+    asker.joined("other")
+    samples = [moving("map", "arm", stamp) for stamp in range(1_000)]
+    heard = Heard(Kind.LIVE, BUS, 1, NOTHING, None, (), serves=False, entries=[ReceivedBatch(samples, (), BUS, 1)])
+    held = sum(asker.holds("one", heard) + asker.holds("other", heard) for _ in range(500))
+    assert held == MOST_HELD_SAMPLES // 1_001
+    asker.end("one")
+    assert asker.holds("other", heard)
+
+
+def test_the_authorities_of_a_peer_have_so_many_letters_together() -> None:
+    refused: list[str] = []
+    peers = Peers(lambda _, reason, __: refused.append(reason))
+    peer = peers.find("stranger")
+    assert peer is not None
+    admitted = [peers.admit_authorities(peer, (f"{number:x}" * 10_000,), 1) for number in range(200)]
+    assert sum(map(len, peer.authorities)) <= MOST_AUTHORITY_TEXT
+    assert not all(admitted)
+    assert refused == ["too many authorities"]
+
+
+async def test_a_link_that_found_no_place_is_met_once_there_is_one() -> None:
+    network = MemoryNetwork()
+    with Bus() as bus:
+        async with DomainLink(bus, "d", network.wire()) as link:
+            receive = network.wires[link.id].receive
+            for number in range(MAX_PEERS + 5):
+                receive(f"{number:032x}", Joined(""))
+            await until(lambda: len(link.peers) == MAX_PEERS and link.statistics().rejected["too many peers"] == 5)
+            assert f"{MAX_PEERS:032x}" not in link.peers
+            receive(f"{MAX_PEERS + 1:032x}", Left())
+            receive(f"{7:032x}", Left())
+            await until(lambda: f"{MAX_PEERS:032x}" in link.peers)
+            receive(f"{8:032x}", Left())
+            await until(lambda: f"{MAX_PEERS + 2:032x}" in link.peers)
+            assert f"{MAX_PEERS + 1:032x}" not in link.peers
+
+
+async def test_filters_that_nobody_hears_make_room_for_others() -> None:
+    network = MemoryNetwork()
+    with Bus() as bus, Bus() as other:
+        async with DomainLink(bus, "d", network.wire()) as link:
+            receive = network.wires[link.id].receive
+            for number in range(MOST_FILTERS + 50):
+                receive(f"{number:032x}", write_text(Kind.QUESTION, {"since": 0, "frames": [f"f{number}"]}))
+            async with DomainLink(other, "d", network.wire(), frames=["arm"]):
+                bus.publish(static("map", "arm"))
+                await until(lambda: "arm" in statics(other))
+                bus.publish(static("room", "arm"))
+                await until(lambda: statics(other)["arm"] == "room")
+                assert link.statistics().rejected == {}
+
+
+async def test_however_often_ways_change_a_bridge_signs_so_often_at_most() -> None:
+    first, second = MemoryNetwork(), MemoryNetwork()
+    signs: list[bytes] = []
+    with Bus() as bus:
+        async with DomainLink(bus, "one", first.wire()) as link, DomainLink(bus, "two", second.wire()):
+            listener = second.wire()
+            await listener.open([Hearing("*", "all")], lambda _, item: signs.append(item), signs.append)  # type: ignore[arg-type]
+            receive = first.wires[link.id].receive
+            receive(STRANGER, Joined(""))
+            begun = anyio.current_time()
+            for number in range(2_000):
+                receive(STRANGER, live(kind=Kind.SIGN, reach=[(number.to_bytes(16, "big"), (OTHER,))]))
+                await anyio.lowlevel.checkpoint()
+            await until(lambda: link.statistics().queue.pending == 0)
+            lasted = anyio.current_time() - begun
+            heard = [item for item in signs if isinstance(item, bytes) and kind_of(item) is Kind.SIGN]
+            assert 1 <= len(heard) <= lasted / SOONEST_SIGN + 2
+
+
+async def test_questions_are_answered_one_a_link_and_leave_half_of_the_time_to_others() -> None:
+    network = MemoryNetwork()
+    with Bus() as bus:
+        async with DomainLink(bus, "d", network.wire()) as link:
+            bus.publish([static("map", f"f{number}") for number in range(500)])
+            answers: list[object] = []
+            asker = network.wire()
+            await asker.open([Hearing("*", "all")], lambda _, item: answers.append(item), answers.append)
+            for _ in range(1_000):
+                asker.send(link.id, write_text(Kind.QUESTION, {"since": 0}))
+            await until(lambda: Kind.ANSWER in map(kind_of, filter(is_bytes, answers)))
+            await until(lambda: link.statistics().queue.pending == 0)
+            count = sum(kind_of(item) is Kind.ANSWER for item in answers if isinstance(item, bytes))
+            # How many depends on when they come, and is far from all.
+            assert count < 500
+
+
+def is_bytes(item: object) -> bool:
+    return isinstance(item, bytes)
