@@ -303,3 +303,24 @@ async def test_a_group_that_one_task_raises_and_the_errors_of_several_tasks_are_
     with pytest.raises(ExceptionGroup) as caught:
         await close_with(*([ExceptionGroup("own", errors)] if in_one_task else errors))
     assert {*caught.value.exceptions} == {*errors}
+
+
+async def test_a_callback_of_another_thread_may_start_and_cancel_tasks() -> None:
+    began, scope = anyio.Event(), anyio.CancelScope()
+
+    async def wait() -> None:
+        with scope:
+            began.set()
+            await anyio.sleep_forever()
+
+    async with anyio.create_task_group() as tasks:
+        start = LoopWaker(lambda: tasks.start_soon(wait))
+        cancel = LoopWaker(scope.cancel)
+        for waker in (start, cancel):
+            waker.bind()
+        for waker in (start, cancel):
+            thread = threading.Thread(target=waker.wake)
+            thread.start()
+            await anyio.to_thread.run_sync(thread.join)
+            with anyio.fail_after(5.0):
+                await began.wait()

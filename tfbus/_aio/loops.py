@@ -11,6 +11,7 @@ import logging
 import threading
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import Context, copy_context
 from time import monotonic
 from typing import Any, cast
 
@@ -41,6 +42,7 @@ class LoopWaker:
         self._call_soon_here: Callable[[Callable[[], object]], object] | None = None
         self._thread = 0
         self._loop_is_closed: Callable[[], bool] = _never
+        self._context: Context
         self._requested = False
 
     @property
@@ -58,6 +60,7 @@ class LoopWaker:
         self._thread = threading.get_ident()
         # trio answers each request that it has accepted. An asyncio loop may be closed with requests left.
         self._loop_is_closed = getattr(native, "is_closed", _never)
+        self._context = copy_context()
         # An earlier loop may have ended without answering a request.
         self._requested = False
 
@@ -85,7 +88,8 @@ class LoopWaker:
     def _call(self) -> None:
         self._requested = False
         try:
-            self._callback()
+            # That of a task: a thread's own does not tell anyio which loop runs, so no task could be started.
+            self._context.run(self._callback)
         except Exception:
             # No task would hear of it, and it would end the whole run of trio.
             logging.getLogger("tfbus").exception("a callback of another thread raised")

@@ -519,6 +519,8 @@ class DomainEnd(Endpoint):
 
     def _leave(self, sender: str) -> None:
         self._waiting.pop(sender, None)
+        for kind in (Kind.QUESTION, Kind.PAST_QUESTION):
+            self._questions.pop((sender, kind), None)
         super()._leave(sender)
         if self._waiting and len(self.peers) < MAX_PEERS:
             link = next(iter(self._waiting))

@@ -235,6 +235,21 @@ class RemoteLookups:
         return RemoteLookupError(domain=self._domain, robot=robot, reason=reason, detail=detail)
 
 
+class _Waiting:
+    """A question that waits; it may be cancelled before its task has begun."""
+
+    __slots__ = ("cancelled", "scope")
+
+    def __init__(self) -> None:
+        self.cancelled = False
+        self.scope: anyio.CancelScope | None = None
+
+    def cancel(self) -> None:
+        self.cancelled = True
+        if self.scope is not None:
+            self.scope.cancel()
+
+
 class Serving(Protocol):
     """A link that can serve a buffer."""
 
@@ -285,7 +300,7 @@ class BufferServer:
         self._allowance = self._most_at_once = max(rate, 1.0)
         self._refilled = monotonic()
         self._entered = False
-        self._waiting: dict[tuple[str, int], anyio.CancelScope] = {}
+        self._waiting: dict[tuple[str, int], _Waiting] = {}
         self._counts: Counter[str] = Counter()
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._lookups: RemoteLookups
@@ -353,23 +368,27 @@ class BufferServer:
             if len(self._waiting) >= self._capacity:
                 self._refuse(*key, "busy", f"{self._capacity} lookups wait there, and no more may")
                 return
-            self._waiting[key] = scope = anyio.CancelScope()
-            self._tasks.start_soon(self._wait, key, question, scope)
+            self._waiting[key] = waiting = _Waiting()
+            self._tasks.start_soon(self._wait, key, question, waiting)
             return
         except Exception as error:  # noqa: BLE001 - it is told to the asker
             answer = error
         self._answer(key, answer)
 
-    async def _wait(self, key: tuple[str, int], question: RemoteQuestion, scope: anyio.CancelScope) -> None:
+    async def _wait(self, key: tuple[str, int], question: RemoteQuestion, waiting: _Waiting) -> None:
         answer: TransformStamped | Exception | None = None
-        with scope:
+        if waiting.cancelled:
+            return
+        with anyio.CancelScope() as waiting.scope:
             try:
                 timeout = as_timeout(question.timeout, LONGEST_WAIT)
                 answer = await self._buffer.lookup(**_arguments(question), timeout=timeout)
             except Exception as error:  # noqa: BLE001 - it is told to the asker
                 answer = error
             finally:
-                self._waiting.pop(key, None)
+                # Another question may have the number by now.
+                if self._waiting.get(key) is waiting:
+                    del self._waiting[key]
         if answer is not None:
             self._answer(key, answer)
 
@@ -397,10 +416,10 @@ class BufferServer:
         return True
 
     def _cancel(self, key: tuple[str, int]) -> None:
-        scope = self._waiting.pop(key, None)
-        if scope is not None:
+        waiting = self._waiting.pop(key, None)
+        if waiting is not None:
             self._counts["cancelled"] += 1
-            scope.cancel()
+            waiting.cancel()
 
     def _refuse(self, asker: str, number: int, reason: str, detail: str) -> None:
         self._counts[reason] += 1

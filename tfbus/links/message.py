@@ -421,7 +421,7 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
         if entry_kind == _REMOVAL and size <= MAX_NAME:
             entries.append(RemovedFrame(origins[origin], entry_number, data[at : at + size].decode()))
             at += size
-        elif entry_kind == _BATCH and size and run_count + size <= MAX_SAMPLES:
+        elif entry_kind == _BATCH and run_count + size <= MAX_SAMPLES:
             run_count += size
             runs = _RUN.iter_unpack(data[at : at + _RUN.size * size])
             at += _RUN.size * size

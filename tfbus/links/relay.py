@@ -38,6 +38,8 @@ LARGEST_JUMP = 2**52
 MANY_PEERS = 20
 """All origins together may have so many times the frames that one of them may have."""
 MAX_ORIGINS = 10_000
+_LEAP = 2**16
+"""A bus skips so many numbers behind one that somebody has made up in its name, for the next ones are mostly taken."""
 _REMEMBERED = 10_000
 _PER_CHILD = 256
 _GONE_CHILDREN = 1_000
@@ -513,7 +515,7 @@ class Relay:
 
     def _outnumber(self, number: int, frames: Iterable[str]) -> None:
         """Skip past a forged number of this bus, and say again what it may have masked."""
-        self._number = number
+        self._number = number + _LEAP
         self.say_again(frames)
 
 
