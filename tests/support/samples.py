@@ -67,6 +67,13 @@ def edges_of(bus: Bus) -> list[FrameAdded]:
         return [event for event in iter(events.queue.get, None) if isinstance(event, FrameAdded)]
 
 
+def latched(bus: Bus) -> dict[str, TransformStamped]:
+    """The static samples that a bus gives to late joiners."""
+    got: list[tuple[TransformStamped, ...]] = []
+    bus.subscribe(got.append).close()
+    return {sample.child: sample for batch in got for sample in batch}
+
+
 # Histories of single frames, and live trees without a bus
 
 
