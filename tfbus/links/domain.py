@@ -163,7 +163,7 @@ class DomainEnd(Endpoint):
     # For the link
 
     async def open(self) -> None:
-        await self._wire.open(self._hearings(), self.take, self._warn_of_network)
+        await self._wire.open(self._hearings(), self.take, self.report.failed)
 
     async def run(self) -> None:
         await self._wire.run()

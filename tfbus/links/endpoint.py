@@ -221,9 +221,6 @@ class Endpoint:
     def _warn_not_sent(self, error: Exception) -> None:
         self._log.warning(str(error), "not sent over the link %s: %s", self.name, error)
 
-    def _warn_of_network(self, error: Exception) -> None:
-        self._log.warning(str(error), "link %s: %s", self.name, error)
-
     def _tell_rejection(self, sender: str, reason: str, error: Exception) -> None:
         self._log.warning((sender, reason), "refused what peer %s sent over the link %s: %s", sender, self.name, error)
         # A copy has no traceback that would keep the message in memory.
