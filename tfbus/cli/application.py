@@ -13,10 +13,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from io import TextIOWrapper
-from typing import TYPE_CHECKING, Annotated, Final, Literal, get_args
-
-if TYPE_CHECKING:
-    from cyclopts import App
+from typing import Annotated, Any, Final, Literal, get_args
 
 FAILED, USAGE_ERROR, INTERRUPTED, ENDED_BY_SIGNAL = 1, 2, 130, 128
 """The exit statuses; the number of a signal is added to the last one."""
@@ -147,13 +144,17 @@ def _panel(title: str, rows: Mapping[str, str], width: int) -> str:
     return "\n".join((f"╭─ {title} {rule[len(title) + 3 :]}╮", *lines, f"╰{rule}╯"))
 
 
-def application(command: str | None) -> "App":
+def application(command: str | None) -> Any:
     """The command line with all its subcommands, none of which is loaded before it is parsed.
 
     Parameters
     ----------
     command : str or None
         The subcommand that is about to be parsed; it shows the whole help of its function.
+
+    Returns
+    -------
+    cyclopts.App
     """
     try:
         from cyclopts import App, Group, Parameter

@@ -113,7 +113,7 @@ class LinkOptions:
 
     @property
     def way(self) -> str:
-        """How others are reached, for people."""
+        """The way to others, for people."""
         if self.ros:
             return f"in {self.place}"
         if self.listen:
