@@ -137,7 +137,7 @@ STATISTICS: list[Any] = [
     QUEUE,
     BusStatistics(1, {"cycle": 2}, 3, 4, 5, 6, 7, 8, (BUFFER,), (QUEUE,)),
     LinkStatistics(1, 2, 3, 4, 5, 6, 7, {"frame name": 8}, {"damaged": 9}, QUEUE),
-    BufferServerStatistics(1, 2, 3, 4, {"busy": 5}, QUEUE),
+    BufferServerStatistics(1, 2, 3, 4, {"busy": 5}),
     RecorderStatistics(1, 2, 3, {"stamp": 4}, QUEUE),
     RobotStatistics(1, 2, {"elbow": 3}),
 ]

@@ -44,7 +44,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "view": ("buffer", "recording", "robot"),
     "plot": ("recording",),
     "testing": ("geometry",),
-    "__init__": ("message_filter", "recording", "testing"),
+    "__init__": ("links", "message_filter", "recording", "testing"),
     "cli": ("__init__", "links", "plot", "view"),
     "__main__": ("cli",),
 }

@@ -34,7 +34,13 @@ def instead(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., object]]
     return lambda other: monkeypatch.setattr(LinkOptions, "run", other)
 
 
-DEFAULTS = {"check": "10.0 100000000.0 100.0 100.0 tf", "demo": "inf 100.0 1.0", "view": "8080 127.0.0.1 30.0 tf"}
+NEED = "--connect and --listen need a package more:"
+DEFAULTS = {
+    "check": "10.0 100000000.0 100.0 100.0 tf",
+    "demo": "inf 100.0 1.0",
+    "router": "tcp/127.0.0.1:17447",
+    "view": "8080 127.0.0.1 30.0 tf",
+}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -66,13 +72,23 @@ def test_the_help_of_all_lists_the_commands_as_wide_as_the_terminal(
     assert {len(line) for line in lines if line.startswith(("╭", "│", "╰"))} == {columns}
     assert max(map(len, lines)) <= columns
     assert tfbus("--help").stdout.splitlines() == tfbus("-h").stdout.splitlines() == lines
+    # With an option, cyclopts prints it, and fills lines with blanks.
+    by_cyclopts = tfbus("--log-level", "debug", "--help").stdout.splitlines()
+    assert [line.rstrip() for line in by_cyclopts] == lines
+
+
+def test_the_level_info_is_not_the_command_of_that_name(tfbus: Command) -> None:
+    for words in (("tree", "--help"), ("--help",)):
+        assert tfbus("--log-level", "info", *words) == tfbus("--log-level", "debug", *words)
 
 
 def test_the_help_names_the_exit_statuses_and_the_variables_of_the_environment(tfbus: Command) -> None:
     for words in ((), ("tree", "--help")):
         text = " ".join(tfbus(*words).stdout.split())
-        for fact in ("0 success", "1 a lookup", "2 wrong usage", "130", "143", "TFBUS_DOMAIN", "TFBUS_CONNECT"):
+        for fact in ("0 success", "1 a lookup", "2 wrong usage", "130", "143"):
             assert fact in text, fact
+        for variable in ("TFBUS_DOMAIN", "TFBUS_CONNECT", "TFBUS_RUNTIME_DIR", "NO_COLOR"):
+            assert variable in text, variable
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -220,7 +236,11 @@ def test_letters_that_the_output_cannot_encode_are_escaped(tmp_path: Path) -> No
     ("package", "arguments", "status", "message"),
     [
         ("cyclopts", "tree", 1, f"the command needs some packages more: {pip_install('cli')}"),
-        ("zenoh", "listen", 2, f"joining a domain needs a package more: {pip_install('cli,zenoh')}"),
+        ("zenoh", "router", 2, f"a router needs a package more: {pip_install('cli,zenoh')}"),
+        *(
+            ("zenoh", f"{words} tcp/127.0.0.1:1", 2, f"{NEED} {pip_install('cli,zenoh')}")
+            for words in ("listen --connect", "tree --listen", "bridge tf dds --connect")
+        ),
         ("mcap.writer", "record run.mcap --domain DOMAIN", 2, f"to record needs a package more: {pip_install('bag')}"),
         (
             "urdf_parser_py",
@@ -237,6 +257,25 @@ def test_a_missing_extra_is_named(package: str, arguments: str, status: int, mes
     assert (done.returncode, done.stdout, done.stderr) == (status, "", f"tfbus: {message}\n")
 
 
+@pytest.mark.thorough
+def test_two_terminals_need_no_zenoh() -> None:
+    hidden = "import sys; sys.modules['zenoh'] = None; from tfbus.cli import main; main()"
+    words = ("--domain", new_domain())
+    with (
+        Program(sys.executable, "-c", hidden, "broadcast", *words) as broadcast,
+        Program(sys.executable, "-c", hidden, "listen", *words) as listen,
+        Program(sys.executable, "-c", hidden, "echo", "base_link", "base_laser", *words) as echo,
+    ):
+        assert listen.output.expect("base_laser: ").startswith("[ INFO]")
+        assert echo.output.expect("Translation") == "- Translation: [0.100000, 0.000000, 0.200000] m"
+        with Program(sys.executable, "-c", hidden, "tree", *words) as tree:
+            assert tree.wait() == 0
+        assert tree.errors.text == "hears 3 peers on this machine\n"
+        for program in (broadcast, listen, echo):
+            assert program.end() == 130
+        assert [program.errors.text.count("\n") for program in (broadcast, echo)] == [1, 0]
+
+
 def test_the_help_of_all_loads_neither_an_optional_package_nor_numpy() -> None:
     script = (
         "import sys, tfbus.cli.application as cli; cli.run(['--help']); "
@@ -244,7 +283,7 @@ def test_the_help_of_all_loads_neither_an_optional_package_nor_numpy() -> None:
     )
     loaded = run_process(sys.executable, "-c", script).stdout.splitlines()[-1].split()
     assert "tfbus" in loaded
-    assert set(loaded) & {"zenoh", "trio", "mcap", "rosbags", "lxml", "numpy", "anyio"} == set()
+    assert set(loaded) & {"cyclopts", "rich", "zenoh", "trio", "mcap", "rosbags", "lxml", "numpy", "anyio"} == set()
 
 
 @pytest.mark.thorough

@@ -8,6 +8,7 @@ import signal
 import socket
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import anyio
@@ -19,10 +20,9 @@ from support.commands import START, Command, check_wrong_call
 from support.processes import PATIENCE, new_domain, start_tfbus
 from support.samples import moving, static
 
-from tfbus import SECOND, Buffer, Bus, ClockResetError, SimulatedClock, TransformStamped, from_seconds
+from tfbus import SECOND, Buffer, Bus, ClockResetError, LocalLink, SimulatedClock, TransformStamped, from_seconds
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.domain import (
-    DEFAULT_LINK,
     LinkOptions,
     RemoteLookups,
     ReplayClock,
@@ -31,8 +31,10 @@ from tfbus.cli.domain import (
     ros_link,
     run,
 )
+from tfbus.links import BufferServer
 from tfbus.testing import simulate
 
+NOBODY = "tcp/127.0.0.1:1"
 BACKENDS = ["asyncio", "trio"]
 
 
@@ -46,14 +48,12 @@ def join(options: LinkOptions) -> None:
 
 
 def test_a_program_asks_the_buffer_of_a_robot_and_of_one_robot_only() -> None:
-    from tfbus.links.zenoh import BufferServer
-
     domain = new_domain()
 
     async def serve_and_ask(remote: RemoteLookups) -> TransformStamped:
         with Bus() as bus, Buffer(bus) as buffer:
             bus.publish(static("map", "base", 2.0))
-            async with BufferServer(buffer, domain, robot="r1"):
+            async with LocalLink(bus, domain, robot="r1") as link, BufferServer(buffer, link):
                 return await remote.lookup("map", "base", timeout=PATIENCE)
 
     assert LinkOptions(domain, robots=("r1",)).run_remote(serve_and_ask).transform.translation == (2.0, 0.0, 0.0)
@@ -114,8 +114,44 @@ def test_an_address_in_use_is_a_usage_error(backend: str, tfbus: Command) -> Non
 
 def test_without_its_extra_joining_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tfbus.links.zenoh", None)
-    with pytest.raises(UsageError, match=re.escape('needs a package more: pip install "tfbus[cli,zenoh]"')):
-        join(DEFAULT_LINK)
+    for options in (LinkOptions(connect=(NOBODY,)), LinkOptions(listen=(NOBODY,))):
+        with pytest.raises(UsageError, match=re.escape('need a package more: pip install "tfbus[cli,zenoh]"')):
+            join(options)
+
+
+def test_a_directory_that_others_can_enter_is_a_usage_error_that_says_what_to_do(
+    tfbus: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tmp_path.chmod(0o755)
+    monkeypatch.setenv("TFBUS_RUNTIME_DIR", str(tmp_path))
+    check_wrong_call(tfbus("tree"), f"other users can enter it: run chmod 700 {tmp_path}, or set TFBUS_RUNTIME_DIR")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (LinkOptions(), "hears 1 peer on this machine"),
+        (LinkOptions(robots=("r1",)), "hears nobody on this machine"),
+        (LinkOptions(listen=(NOBODY,)), f"hears nobody by the router of this program at {NOBODY}"),
+        (LinkOptions(connect=(NOBODY, "tcp/a:1")), f"hears nobody by a router at {NOBODY} or tcp/a:1"),
+    ],
+)
+def test_it_is_said_whom_a_program_hears_and_how(
+    options: LinkOptions, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = replace(options, domain=new_domain())
+
+    async def meet() -> None:
+        met = anyio.Event()
+        with Bus() as bus, Bus() as other, bus.subscribe(lambda _: met.set()):
+            async with options.join(bus) as links, LocalLink(other, options.domain):
+                if "1 peer" in said:
+                    other.publish(static("map", "odom"))
+                    await met.wait()
+                options.say_who_is_heard(links)
+
+    anyio.run(meet)
+    assert capsys.readouterr() == ("", f"{said}\n")
 
 
 @pytest.mark.parametrize(("seconds", "notice"), [(0.9, ""), (60.0, "waiting for transforms on domain 'yard' …\n")])

@@ -1,23 +1,19 @@
 """The command line: the subcommands, the options of all of them, and the exit status for whatever happens.
 
-`run` parses the words with cyclopts, which loads the module of the one subcommand that they name; the help of all is a
-list of `COMMANDS`, and loads none. A subcommand returns its exit status, or None for success. It raises `UsageError`,
-a `RecordingError` or a `TransformLookupError` for what a user can cause, and `run` prints a line for each.
+`run` parses the words with cyclopts, which loads the module of the one subcommand that they name. The help of all is
+printed without cyclopts, which takes several times as long to load. A subcommand returns its exit status, or None for
+success. It raises `UsageError`, a `RecordingError` or a `TransformLookupError` for what a user can cause, and `run`
+prints a line for each.
 """
 
 import os
+import shutil
 import sys
-from collections.abc import Callable, Sequence
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from io import TextIOWrapper
-from typing import Annotated, Literal
-
-try:
-    from cyclopts import App, CycloptsError, Group, Parameter
-except ImportError:
-    from tfbus.errors import pip_install
-
-    raise SystemExit(f"tfbus: the command needs some packages more: {pip_install('cli')}") from None
+from typing import Annotated, Any, Final, Literal, get_args
 
 FAILED, USAGE_ERROR, INTERRUPTED, ENDED_BY_SIGNAL = 1, 2, 130, 128
 """The exit statuses; the number of a signal is added to the last one."""
@@ -58,10 +54,15 @@ _SUMMARY = "Stamped coordinate transforms for asyncio and trio."
 _EXIT_STATUSES = (
     "Exit status: 0 success; 1 a lookup or a recording has failed, or a check has found something; 2 wrong usage, or a "
     "file that cannot be used; 130 ended by Ctrl-C; 143 ended by a termination. Variables of the environment: "
-    "TFBUS_DOMAIN, TFBUS_CONNECT (addresses with blanks between them), NO_COLOR."
+    "TFBUS_DOMAIN, TFBUS_CONNECT (addresses with blanks between them), TFBUS_RUNTIME_DIR (where programs of this "
+    "machine meet), NO_COLOR."
 )
+_INSTALL_COMPLETION = "Install completion for the shell that is in use, and exit."
+_OPTIONS_OF_ALL = "Options of all commands"
+_LOG_LEVEL = "The least important log lines that are shown on standard error."
 
 _LogLevel = Literal["debug", "info", "warning", "error", "critical"]
+_DEFAULT_LEVEL: Final = "warning"
 _Program = Callable[[], int | None]
 
 
@@ -78,11 +79,16 @@ def run(words: Sequence[str], loaded: Callable[[], object] = lambda: None) -> in
     if isinstance(sys.stdout, TextIOWrapper):
         # Its encoding may lack the letters of a frame name.
         sys.stdout.reconfigure(errors="backslashreplace")
+    # `info` is a level of the log, too.
+    named = (word for before, word in zip(("", *words), words, strict=False) if before != "--log-level")
+    command = next((word for word in named if word in COMMANDS), None)
+    app = None if list(words) in ([], ["-h"], ["--help"]) else application(command)
     status = 0
     try:
-        app = application(next((word for word in words if word in COMMANDS), None))
-        # Without a word, cyclopts would print the help as a program, for which more modules are loaded.
-        prepare, arguments, _ = app.meta.parse_args(words or ["--help"], exit_on_error=False, print_error=False)
+        if app is None:
+            print(_overview(), flush=True)
+            return status
+        prepare, arguments, _ = app.meta.parse_args(words, exit_on_error=False, print_error=False)
         program = prepare(*arguments.args, **arguments.kwargs)
         # Help has been printed by now.
         if program is not None:
@@ -101,14 +107,61 @@ def run(words: Sequence[str], loaded: Callable[[], object] = lambda: None) -> in
     return status
 
 
-def application(command: str | None) -> App:
+def _overview() -> str:
+    """The help of all commands, laid out as cyclopts does it."""
+    width = shutil.get_terminal_size((80, 24)).columns
+    commands = COMMANDS | {
+        "--help (-h)": "Display this message and exit.",
+        "--install-completion": _INSTALL_COMPLETION,
+        "--version": "Display application version.",
+    }
+    levels = f"[choices: {', '.join(get_args(_LogLevel))}] [default: {_DEFAULT_LEVEL}]"
+    parts = (
+        "Usage: tfbus COMMAND [OPTIONS]\n",
+        _SUMMARY + "\n",
+        _panel("Commands", commands, width),
+        _panel(_OPTIONS_OF_ALL, {"--log-level CHOICE": f"{_LOG_LEVEL} {levels}"}, width) + "\n",
+        textwrap.fill(_EXIT_STATUSES, width, break_on_hyphens=False),
+    )
+    text = "\n".join(parts)
+    try:
+        text.encode(sys.stdout.encoding or "ascii")
+    except UnicodeEncodeError:
+        return text.translate(str.maketrans("╭╮╰╯─│", "++++-|"))
+    return text
+
+
+def _panel(title: str, rows: Mapping[str, str], width: int) -> str:
+    """A box with a name and its meaning a row."""
+    names = max(map(len, rows))
+    room = max(width - names - 6, 8)
+    lines = [
+        f"│ {'' if number else name:{names}}  {line:{room}} │"
+        for name, meaning in rows.items()
+        for number, line in enumerate(textwrap.wrap(meaning, room, break_on_hyphens=False))
+    ]
+    rule = "─" * (names + room + 4)
+    return "\n".join((f"╭─ {title} {rule[len(title) + 3 :]}╮", *lines, f"╰{rule}╯"))
+
+
+def application(command: str | None) -> Any:
     """The command line with all its subcommands, none of which is loaded before it is parsed.
 
     Parameters
     ----------
     command : str or None
         The subcommand that is about to be parsed; it shows the whole help of its function.
+
+    Returns
+    -------
+    cyclopts.App
     """
+    try:
+        from cyclopts import App, Group, Parameter
+    except ImportError:
+        from tfbus.errors import pip_install
+
+        raise SystemExit(f"tfbus: the command needs some packages more: {pip_install('cli')}") from None
     app = App(
         name="tfbus",
         help=_SUMMARY,
@@ -122,20 +175,16 @@ def application(command: str | None) -> App:
     for name, summary in COMMANDS.items():
         path = f"tfbus.cli.commands.{_MODULES.get(name, name)}:{name}"
         app.command(path, name=name, help=None if name == command else summary)
-    app.register_install_completion_command(help="Install completion for the shell that is in use, and exit.")
+    app.register_install_completion_command(help=_INSTALL_COMPLETION)
 
     @app.meta.default
     def prepare(
         *words: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
-        log_level: Annotated[_LogLevel, Parameter(group=Group("Options of all commands", sort_key=9))] = "warning",
+        log_level: Annotated[
+            _LogLevel, Parameter(group=Group(_OPTIONS_OF_ALL, sort_key=9), help=_LOG_LEVEL)
+        ] = _DEFAULT_LEVEL,
     ) -> _Program:
-        """Parse the command line.
-
-        Parameters
-        ----------
-        log_level
-            The least important log lines that are shown on standard error.
-        """
+        """Parse the command line."""
         function, arguments, _ = app.parse_args(words, exit_on_error=False, print_error=False)
         return partial(_run_logging, log_level, partial(function, *arguments.args, **arguments.kwargs))
 
@@ -144,7 +193,9 @@ def application(command: str | None) -> App:
 
 def _shown_default(default: object) -> str | None:
     """A default as the help shows it; None where the option changes nothing unless it is given."""
-    return None if default is None or default is False or default in ("", ()) else str(default)
+    if default is None or default is False or default in ("", ()):
+        return None
+    return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
 
 
 # These are loaded where they are used: the help and the version do without most of them.
@@ -174,6 +225,8 @@ def _report(errors: BaseExceptionGroup[BaseException], status: int) -> int:
 
 
 def _usage_errors() -> tuple[type[Exception], ...]:
+    from cyclopts import CycloptsError
+
     from tfbus.cli.arguments import UsageError
     from tfbus.errors import RecordingError
 

@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Protocol, TypeVar
 
@@ -26,7 +26,7 @@ from tfbus.cli.output import say, warn
 from tfbus.clock import Clock, JumpCallback, SimulatedClock, SystemClock
 from tfbus.errors import ClockResetError, InvalidTransformError, pip_install
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.link import DomainLink, DomainOptions
+from tfbus.links.link import DomainLink, DomainOptions, Link
 from tfbus.links.local import LocalLink
 from tfbus.registration import Registration
 from tfbus.stamps import SECOND, as_stamp
@@ -111,7 +111,18 @@ class LinkOptions:
         """The place that is joined, for people."""
         return f"ROS at {' and '.join(self.ros)}" if self.ros else f"domain {self.domain!r}"
 
-    def run(self, program: Callable[[Bus], Awaitable[T]], *, clock: Clock | None = None) -> T:
+    @property
+    def way(self) -> str:
+        """The way to others, for people."""
+        if self.ros:
+            return f"in {self.place}"
+        if self.listen:
+            return f"by the router of this program at {' and '.join(self.listen)}"
+        return f"by a router at {' or '.join(self.connect)}" if self.connect else "on this machine"
+
+    def run(
+        self, program: Callable[[Bus], Awaitable[T]], *, clock: Clock | None = None, links: list[Link] | None = None
+    ) -> T:
         """Run a program on a bus that has joined the domain, until its end or Ctrl-C.
 
         Parameters
@@ -120,6 +131,8 @@ class LinkOptions:
         clock : Clock, optional
             The clock of the bus. The time of a `SimulatedClock` is told to the domain; a `ReplayClock` follows the time
             that is told there.
+        links : list, optional
+            Is given the links of the bus before the program begins.
 
         Returns
         -------
@@ -135,14 +148,16 @@ class LinkOptions:
 
         async def join_and_run() -> T:
             with Bus(clock) as bus:
-                async with self.join(bus):
+                async with self.join(bus) as joined:
+                    if links is not None:
+                        links.extend(joined)
                     return await program(bus)
 
         return run(join_and_run, self.backend)
 
     @asynccontextmanager
-    async def join(self, bus: Bus) -> AsyncIterator[None]:
-        """Link a bus to the domain, or to ROS, for the body of an ``async with``.
+    async def join(self, bus: Bus) -> AsyncIterator[Sequence[Link]]:
+        """Link a bus to the domain, or to ROS, for the body of an ``async with``, which is given the links.
 
         Raises
         ------
@@ -152,13 +167,14 @@ class LinkOptions:
         follower = bus.clock if isinstance(bus.clock, ReplayClock) else None
         if self.ros:
             async with AsyncExitStack() as stack:
+                links = []
                 for place in self.ros:
                     try:
-                        await stack.enter_async_context(ros_link(bus, place, clock=follower))
+                        links.append(await stack.enter_async_context(ros_link(bus, place, clock=follower)))
                     except OSError as error:
                         why = os.strerror(error.errno) if error.errno else error
                         raise UsageError(f"cannot join ROS at {place}: {why}") from None
-                yield
+                yield links
             return
         options: DomainOptions = {
             "robot": self.robot,
@@ -166,8 +182,8 @@ class LinkOptions:
             "clock": follower,
             "tell_clock": isinstance(bus.clock, SimulatedClock),
         }
-        async with self._entered(bus, options):
-            yield
+        async with self._entered(bus, options) as link:
+            yield [link]
 
     def run_remote(self, program: Callable[[RemoteLookups], Awaitable[T]]) -> T:
         """Run a program that asks the buffer of another program, that of the robot in `robots`, until its end.
@@ -214,7 +230,7 @@ class LinkOptions:
             raise UsageError(_NO_ZENOH) from None
         return ZenohLink(bus, self.domain, listen=self.listen or None, connect=self.connect or None, **options)
 
-    async def first_transform(self, bus: Bus) -> None:
+    async def first_transform(self, bus: Bus, links: Sequence[Link] = ()) -> None:
         """Wait until something is published on the bus, with a notice if that takes more than a second."""
         arrived = anyio.Event()
         with bus.subscribe(lambda _: arrived.set()):
@@ -222,7 +238,14 @@ class LinkOptions:
                 await arrived.wait()
                 return
             say(f"waiting for transforms on {self.place} …")
+            self.say_who_is_heard(links)
             await arrived.wait()
+
+    def say_who_is_heard(self, links: Sequence[Link]) -> None:
+        """Print how many peers the links have, and how they are reached; nothing without a link."""
+        if links:
+            peers = sum(len(link.peers) for link in links)
+            say(f"hears {'nobody' if not peers else '1 peer' if peers == 1 else f'{peers:,} peers'} {self.way}")
 
 
 DEFAULT_LINK = LinkOptions()
@@ -329,7 +352,7 @@ def is_ros(place: str) -> bool:
     return any(kind.fullmatch(place) for kind in (_DDS, _ZENOH, _WEBSOCKET))
 
 
-def ros_link(bus: Bus, place: str, **options: Any) -> AbstractAsyncContextManager[object]:
+def ros_link(bus: Bus, place: str, **options: Any) -> Link:
     """The link to a place: ``dds``, ``dds:42``, ``zenoh:host:7447`` or ``ws://host:9090``.
 
     Parameters

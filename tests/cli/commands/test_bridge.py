@@ -69,8 +69,29 @@ async def test_a_bridge_between_rosbridge_and_rmw_zenoh_tells_what_is_refused_an
             assert bridge.errors.text.count("refused what peer") == 1
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("names", [("yard", "yard"), ("yard", "hall")])
+def test_frames_pass_between_a_domain_of_this_machine_and_a_router_and_between_two_behind_it(
+    names: tuple[str, str],
+) -> None:
+    pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
+    unique = new_domain()
+    first, second = (f"{unique}-{name}" for name in names)
+    address = free_address()
+    by_router = ("--connect", address)
+    with (
+        start_tfbus("bridge", first, second, "--listen", address) as bridge,
+        start_tfbus("static", "map", "base", "--domain", first, *(() if first == second else by_router)),
+        start_tfbus("static", "base", "laser", "--xyz", "1", "2", "3", "--domain", second, *by_router),
+        start_tfbus("echo", "map", "laser", "--domain", second, *by_router) as echo,
+    ):
+        assert echo.output.expect("Translation") == "- Translation: [1.000000, 2.000000, 3.000000] m"
+        assert bridge.end() == 130
+
+
 def test_a_bridge_has_two_ends(tfbus: Command) -> None:
-    check_wrong_call(tfbus("bridge", "dds", "dds"), "two places")
+    for words in (("dds", "dds"), ("tf", "domain:tf"), ("dds", "dds", "--connect", "tcp/127.0.0.1:1")):
+        check_wrong_call(tfbus("bridge", *words), "two places")
 
 
 def test_ros_that_is_not_there_is_a_usage_error(tfbus: Command) -> None:

@@ -5,13 +5,13 @@ import anyio
 import anyio.to_thread
 import pytest
 from support.commands import Command, check_wrong_call
-from support.processes import free_address, new_domain, start_tfbus
+from support.processes import new_domain, start_tfbus
 from support.samples import moving, static
 
-from tfbus import SECOND, Buffer, Bus, Transform, TransformStamped
+from tfbus import SECOND, Buffer, Bus, LocalLink, Transform, TransformStamped
 from tfbus.cli.commands.echo import describe, to_json
 from tfbus.cli.domain import ReplayClock
-from tfbus.links.zenoh import BufferServer
+from tfbus.links import BufferServer
 
 MOVING = TransformStamped(
     "map", "base_link", 1_700_000_000_000_000_001, Transform.from_xyz_rpy((1, -2, 0.5), (0, 0, -0.5))
@@ -114,12 +114,12 @@ def test_no_age_is_shown_and_nothing_is_told_before_the_time_of_a_simulation_is_
 
 @pytest.mark.thorough
 def test_remote_transforms_come_from_the_buffer_of_another_program() -> None:
-    domain, address = new_domain(), free_address()
-    options = ("--remote", "--rate", "5", "--json", "--domain", domain, "--connect", address)
+    domain = new_domain()
+    options = ("--remote", "--rate", "5", "--json", "--domain", domain)
 
     async def serve() -> None:
         with Bus() as bus, Buffer(bus) as buffer:
-            async with BufferServer(buffer, domain, robot="r1", listen=address):
+            async with LocalLink(bus, domain, robot="r1") as link, BufferServer(buffer, link):
                 bus.publish(static("map", "base", 2.0))
                 with start_tfbus("echo", "map", "base", *options, "--robots", "r1") as echo:
                     line = await anyio.to_thread.run_sync(echo.output.expect, "translation")

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("foxglove", reason="serving Foxglove needs foxglove-sdk")
 
 from support.commands import Command, check_wrong_call
-from support.processes import free_address, new_domain, start_tfbus
+from support.processes import new_domain, start_tfbus
 
 from tfbus import Bus
 
@@ -14,7 +14,7 @@ from tfbus import Bus
 @pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 def test_the_address_is_printed_and_served_until_ctrl_c(backend: str) -> None:
-    domain = ("--domain", new_domain(), "--listen", free_address(), "--backend", backend)
+    domain = ("--domain", new_domain(), "--backend", backend)
     with start_tfbus("foxglove", "--port", "0", *domain) as server:
         address = server.output.expect("ws://127.0.0.1:")
         with socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2]))):

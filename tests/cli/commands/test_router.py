@@ -13,13 +13,30 @@ def test_programs_that_know_only_the_router_hear_each_other(backend: str) -> Non
     address, domain = free_address(), new_domain()
     options = ("--connect", address, "--domain", domain)
     with start_tfbus("router", "--listen", address, "--backend", backend) as router:
-        assert router.errors.expect("routing") == f"routing at {address} …"
+        assert router.errors.expect("routing") == f"routing at {address}, until Ctrl-C"
         with (
             start_tfbus("static", "base_link", "laser", "--xyz", "1", "2", "3", "--robot", "r1", *options),
             start_tfbus("echo", "base_link", "laser", "--robots", "r*", *options) as echo,
         ):
             assert echo.output.expect("Translation") == "- Translation: [1.000000, 2.000000, 3.000000] m"
+            with start_tfbus("tree", *options) as tree:
+                assert tree.wait() == 0
+            assert tree.errors.text == f"hears 2 peers by a router at {address}\n"
         assert router.end() == 130
+
+
+@pytest.mark.thorough
+def test_routers_that_are_connected_are_as_one() -> None:
+    addresses, domain = [free_address(), free_address()], ("--domain", new_domain())
+    with (
+        start_tfbus("router", "--listen", addresses[0]),
+        start_tfbus("router", "--listen", addresses[1], "--connect", addresses[0]) as router,
+        start_tfbus("broadcast", *domain, "--connect", addresses[0]),
+        start_tfbus("listen", *domain, "--connect", addresses[1]) as listen,
+    ):
+        said = f"routing at {addresses[1]}, and on to {addresses[0]}, until Ctrl-C"
+        assert router.errors.expect("routing") == said
+        assert "INFO" in listen.output.expect("base_laser: ")
 
 
 def test_an_address_in_use_is_a_usage_error(tfbus: Command) -> None:

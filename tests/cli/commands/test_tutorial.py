@@ -5,7 +5,7 @@ import signal
 
 import pytest
 from support.commands import START, Command
-from support.processes import free_address, new_domain, start_tfbus
+from support.processes import new_domain, start_tfbus
 
 from tfbus import SECOND, Buffer, Bus, SimulatedClock, Transform, TransformBroadcaster, TransformStamped
 from tfbus.cli.commands import tutorial
@@ -127,21 +127,19 @@ def test_the_listener_waits_for_a_broadcaster_and_prints_a_line_a_period_from_th
 @pytest.mark.thorough
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_either_program_may_be_killed_and_started_again(backend: str) -> None:
-    domain, address = new_domain(), free_address()
-    options = ("--domain", domain, "--backend", backend)
-    with start_tfbus("listen", "--rate", "5", "--connect", address, *options) as listener:
+    options = ("--domain", new_domain(), "--backend", backend)
+    with start_tfbus("listen", "--rate", "5", *options) as listener:
         waiting = listener.errors.expect("waiting")
-        with start_tfbus("broadcast", "--listen", address, *options) as broadcaster:
+        with start_tfbus("broadcast", *options) as broadcaster:
             listener.output.expect(INFO)
             assert broadcaster.end(signal.SIGKILL) == -signal.SIGKILL
         listener.output.expect(LATE)
-        with start_tfbus("broadcast", "--listen", address, *options) as broadcaster:
+        with start_tfbus("broadcast", *options) as broadcaster:
             listener.output.expect(INFO)
             assert listener.end(signal.SIGKILL) == -signal.SIGKILL
-            with start_tfbus("listen", "--connect", address, *options) as another:
+            with start_tfbus("listen", *options) as another:
                 another.output.expect(INFO)
                 assert (another.end(), broadcaster.end()) == (130, 130)
-    # Neither a traceback, nor anything that zenoh prints by itself.
     assert listener.errors.text == f"{waiting}\n"
     assert set(another.errors.text.splitlines()) <= {waiting}
 

@@ -1,5 +1,6 @@
 """``tfbus bridge``."""
 
+from dataclasses import replace
 from typing import Annotated
 
 import anyio
@@ -26,32 +27,49 @@ def bridge(
     of rmw_zenoh, ws://host:9090 for a rosbridge server of ROS 1 or ROS 2, or the name of a domain; domain:dds is a
     domain of that name. Several bridges in a ring pass each sample on once.
 
+    A domain is that of this machine, or with --listen or --connect the one behind the router. To bridge the two, name
+    the domain twice.
+
     Example: tfbus bridge tf dds
+
+    Example: tfbus bridge tf tf --connect tcp/192.168.1.5:7447
 
     Parameters
     ----------
     first
     second
     listen
-        Listen at this address for programs of a domain; may be given several times.
+        Run a router in this program that listens at this address; may be given several times.
     connect
-        Connect to a program or a router of a domain that listens at this address; may be given several times.
+        Connect to the router at this address; may be given several times, for routers that are tried in turn.
     backend
         The event loop to run on.
     """
-    if first == second:
-        raise UsageError(f"a bridge needs two places, not {first!r} twice")
-    ends = [_options(place, listen, connect, backend) for place in (first, second)]
+    one, other = (_options(place, listen, connect, backend) for place in (first, second))
+    names = one.place, other.place
+    if one == other:
+        if one.ros or not (listen or connect):
+            raise UsageError(f"a bridge needs two places, not {first!r} twice")
+        one = LinkOptions(one.domain, backend=backend)
+        names = f"{one.place} {one.way}", f"the same {other.way}"
+    elif one.listen and other.listen:
+        # Its router is in this program already.
+        one = replace(one, listen=(), connect=tuple(map(_reachable, listen)))
 
     async def pass_on(bus: Bus) -> None:
-        async with ends[1].join(bus):
-            say(f"passing on between {ends[0].place} and {ends[1].place}, until Ctrl-C")
+        async with one.join(bus):
+            say(f"passing on between {' and '.join(names)}, until Ctrl-C")
             await anyio.sleep_forever()
 
-    ends[0].run(pass_on)
+    other.run(pass_on)
 
 
 def _options(place: str, listen: tuple[str, ...], connect: tuple[str, ...], backend: Backend) -> LinkOptions:
     if is_ros(place):
         return LinkOptions(ros=(place,), backend=backend)
     return LinkOptions(place.removeprefix("domain:"), listen, connect, backend=backend)
+
+
+def _reachable(address: str) -> str:
+    """The address of a router of this program for this program."""
+    return address.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")

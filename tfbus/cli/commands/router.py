@@ -9,25 +9,26 @@ from tfbus.cli.domain import run
 from tfbus.cli.output import say
 from tfbus.errors import pip_install
 
-_MEETING_POINT = "tcp/127.0.0.1:17447"
+_ON_THIS_MACHINE = "tcp/127.0.0.1:17447"
 
 
 def router(
     *,
-    listen: tuple[str, ...] = (_MEETING_POINT,),
+    listen: tuple[str, ...] = (_ON_THIS_MACHINE,),
     connect: tuple[str, ...] = (),
     backend: Backend = "asyncio",
 ) -> None:
     """Pass on what programs of all domains send each other, until Ctrl-C.
 
-    For programs that cannot reach each other, and for fleets. Programs connect to it with --connect.
+    For programs on several machines, or of several users of one. They connect to it with --connect; each program needs
+    one router, and routers that are connected are as one.
 
     Example: tfbus router --listen tcp/192.168.1.5:7447
 
     Parameters
     ----------
     listen
-        Listen at this address; may be given several times.
+        Listen at this address; may be given several times. Only this machine reaches the default.
     connect
         Connect to another router that listens at this address; may be given several times.
     backend
@@ -41,7 +42,8 @@ def router(
     async def route() -> None:
         try:
             async with ZenohRouter(listen, connect=connect):
-                say(f"routing at {' and '.join(listen)} …")
+                onward = f", and on to {' and '.join(connect)}" if connect else ""
+                say(f"routing at {' and '.join(listen)}{onward}, until Ctrl-C")
                 await anyio.sleep_forever()
         except OSError as error:
             why = os.strerror(error.errno) if error.errno else error

@@ -15,6 +15,7 @@ from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, ReplayClock
 from tfbus.cli.output import print_now, say, write_file
 from tfbus.cli.tree_display import TreeDisplay
+from tfbus.links.link import Link
 from tfbus.stamps import to_seconds
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import to_dot
@@ -41,6 +42,8 @@ def tree(
 ) -> None:
     """Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.
 
+    Standard error then says how many programs it hears, and how they are reached.
+
     Example: tfbus tree --svg frames.svg
 
     Parameters
@@ -65,6 +68,7 @@ def tree(
         Print a JSON document instead, with --watch one a line: for each frame its parent, kind, rate (Hz), age (s),
         span (s) and authority; null for a value that the frame does not have.
     """
+    links: list[Link] = []
     pictures = {kind: path for kind, path in (("svg", svg), ("pdf", pdf), ("png", png)) if path is not None}
 
     async def show_tree(bus: Bus) -> None:
@@ -88,7 +92,7 @@ def tree(
                 else:
                     display.show(edges, now)
 
-            await link.first_transform(bus)
+            await link.first_transform(bus, links)
             if watch:
                 async for _ in bus.clock.ticks(rate):
                     await show_once()
@@ -100,8 +104,9 @@ def tree(
                 await show_once()
                 for remark in remarks(buffer.tree.edges()):
                     say(remark)
+                link.say_who_is_heard(links)
 
-    link.run(show_tree, clock=ReplayClock())
+    link.run(show_tree, clock=ReplayClock(), links=links)
 
 
 async def _listen_for_a_period(bus: Bus, tree: TransformTree) -> None:

@@ -224,7 +224,9 @@ class ZenohWire:
             elif since is not None and monotonic() > since + FIRST_WAIT:
                 since = None
                 where = ", ".join(sorted(self._addresses))
-                self._failure = OSError(f"no zenoh router answers at {where}, and the link goes on trying: {failure}")
+                # zenoh's usual error names the addresses once more, and no reason.
+                why = "" if "Unable to connect to any of" in str(failure) else f": {failure}"
+                self._failure = OSError(f"no router answers at {where}, and the link goes on trying{why}")
             self._wake()
             if self._is_router:
                 return None
