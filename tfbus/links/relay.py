@@ -150,7 +150,7 @@ class Relay:
         self._passed: PassedSamples | None = None
 
     def attach(self, outbox: Outbox, foreign: bool = False) -> None:
-        """Give a link all that is latched, and all that is published from now on.
+        """Give a link all that is latched or known by others, and all that is published from now on.
 
         Parameters
         ----------
@@ -166,6 +166,9 @@ class Relay:
             self._passed = PassedSamples()
         if not self._outboxes:
             self._registration = self._bus.subscribe(self._on_batch, self._on_removal)
+        for other in self._outboxes:
+            for entry in other.kept():
+                outbox.keep(entry)
         self._bus.subscribe(lambda batch: self._send_latched(batch, outbox)).close()
         self._outboxes.append(outbox)
 

@@ -274,6 +274,11 @@ class Replica:
                 found.append(_told(frame, entry))
         return found
 
+    def told(self) -> Iterator[OutgoingBatch | RemovedFrame]:
+        """All entries."""
+        for frame, entry in self.entries.items():
+            yield _told(frame, entry)
+
     def moving(self) -> list[str]:
         """The moving frames that this link brings to the domain, sorted."""
         return sorted(
