@@ -345,13 +345,12 @@ class Relay:
                     self._release(origin, frame)
 
     def mask(self, provenance: Provenance, samples: Sequence[TransformStamped]) -> None:
-        """Withdraw frames of which a lost bus was the last to speak, but say again which of them are this bus's own."""
+        """Withdraw frames of which a lost bus was the last to speak, until it is back or somebody speaks of them again."""
         self._number = max(self._number, provenance.sequence)
         for outbox in self._outboxes:
             if outbox is not provenance.outbox:
                 outbox.keep(OutgoingBatch(provenance.origin, provenance.sequence, samples))
         frames = sorted({sample.child for sample in samples})
-        self.say_again(frames)
         for frame in frames:
             latest = self._latest.get(frame)
             if not self._bus.closed and latest is not None and latest.rank < provenance.rank:
