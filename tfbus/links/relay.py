@@ -345,7 +345,7 @@ class Relay:
                     self._release(origin, frame)
 
     def mask(self, provenance: Provenance, samples: Sequence[TransformStamped]) -> None:
-        """Withdraw frames of which a lost bus was the last to speak, until it is back or somebody speaks of them again."""
+        """Withdraw frames of which a lost bus was the last to speak, until a way leads to it or others speak."""
         self._number = max(self._number, provenance.sequence)
         for outbox in self._outboxes:
             if outbox is not provenance.outbox:
