@@ -599,6 +599,8 @@ class DomainEnd(Endpoint):
             if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
                 raise MalformedMessageError("text", "a filter without names")
             frames = frozenset(names)
+            if self.frames is None or frames <= self.frames:
+                self._agreement.filters(sender, frames)
             if not self._channels.serve(frames, self._now()):
                 error = ValueError("too many different filters to serve")
                 self.peers.reject(sender, "too many filters", error)
