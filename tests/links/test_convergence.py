@@ -104,6 +104,31 @@ def test_buses_with_both_settings_agree_among_themselves(seeds: range) -> None:
 @pytest.mark.parametrize(
     "seeds", [range(10), pytest.param(range(10, 500), marks=pytest.mark.thorough)], ids=["few", "many"]
 )
+def test_links_that_hear_only_some_frames_hold_exactly_these_in_the_end(seeds: range, drop_lost: bool) -> None:
+    for seed in seeds:
+        world = World(seed)
+        network = Network(world)
+        others = [world.process(network, drop_lost=drop_lost) for _ in range(3)]
+        chosen = {"static0", "static3", *(f"moving of {process.wire.id[:4]}" for process in others[:2])}
+        leaves = [world.process(network, drop_lost=drop_lost, frames=frames) for frames in (chosen, {"static0"}, set())]
+        world.run(world.random.choice((0.0, 5.0)))
+        trouble(world, [network], 30, [drop_lost])
+        whole = world.process(network, drop_lost=drop_lost)
+        end_of_trouble(world, [network])
+        world.run(LIMIT)
+        until_they_agree(world, [[process for process in world.processes if process not in leaves]])
+        for leaf, frames in zip(leaves, (chosen, {"static0"}, set[str]()), strict=True):
+            said_here = {sample.child for sample in leaf.seen if sample.authority == leaf.wire.id[:4]}
+            assert {sample.child for sample in leaf.seen} <= frames | said_here
+            if leaf in world.processes:
+                held = {frame: stamp for frame, stamp in shown(leaf).items() if frame in frames}
+                assert held == {frame: stamp for frame, stamp in shown(whole).items() if frame in frames}
+
+
+@pytest.mark.parametrize("drop_lost", [False, True])
+@pytest.mark.parametrize(
+    "seeds", [range(10), pytest.param(range(10, 500), marks=pytest.mark.thorough)], ids=["few", "many"]
+)
 def test_buses_behind_bridges_and_in_rings_agree(seeds: range, drop_lost: bool) -> None:
     for seed in seeds:
         world = World(seed)

@@ -259,6 +259,21 @@ def test_a_frame_that_a_lost_bus_has_taken_over_is_gone_until_it_is_said_again()
     assert one.frames == three.frames == late.frames == {"tool": static("map", "tool", 3.0)}
 
 
+def test_what_was_said_beyond_a_bridge_that_was_cut_off_holds_against_what_was_said_before() -> None:
+    for seed in range(10):
+        world, (near, bridge, far) = domains([[0, 1], [1, 2]], drop_lost=True, seed=seed)
+        near.say(static("map", "tool", 1.0))
+        world.run(5.0)
+        network = far.wire.network
+        network.cut(far.wire)
+        world.run(5.0)
+        far.say(static("map", "tool", 2.0))
+        world.run(5.0)
+        network.heal()
+        world.run(10.0)
+        assert near.frames == bridge.frames == far.frames == {"tool": static("map", "tool", 2.0)}
+
+
 @pytest.mark.thorough
 def test_frames_that_come_and_go_by_the_ten_thousand_leave_little_behind() -> None:
     world, (one, two) = domains(GRAPHS["pair"])

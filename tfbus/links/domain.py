@@ -79,15 +79,22 @@ class DomainOutbox(Outbox):
     def reach_changed(self) -> None:
         self._end.sign_soon()
 
-    def keep(self, batch: OutgoingBatch) -> None:
-        own, rank = self._end.own, (batch.sequence, batch.origin)
-        for sample in batch.samples:
+    def keep(self, entry: OutgoingBatch | RemovedFrame) -> None:
+        own, rank = self._end.own, (entry.sequence, entry.origin)
+        if isinstance(entry, RemovedFrame):
+            if self._frames is None or entry.frame in self._frames:
+                own.note(entry.frame, rank, None, ours=True)
+            return
+        for sample in entry.samples:
             _, child, _, _, _, static = sample._fields
             if (self._frames is None or child in self._frames) and can_hold(sample):
                 try:
                     own.note(child, rank, sample, ours=True, settles=not static)
                 except TooManyEntriesError:
                     continue
+
+    def kept(self) -> Iterator[OutgoingBatch | RemovedFrame]:
+        return self._end.kept()
 
     def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
         if not echo:
@@ -241,6 +248,11 @@ class DomainEnd(Endpoint):
         """Serve a buffer, or none any more."""
         self.lookups.server = server
         self.sign_soon()
+
+    def kept(self) -> Iterator[OutgoingBatch | RemovedFrame]:
+        """All that the copies hold."""
+        for replica in self._replicas.values():
+            yield from replica.told()
 
     def ways(self) -> Iterator[Way]:
         """The buses that the peers lead to, each with the buses on the way there."""
@@ -592,6 +604,8 @@ class DomainEnd(Endpoint):
             if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
                 raise MalformedMessageError("text", "a filter without names")
             frames = frozenset(names)
+            if self.frames is None or frames <= self.frames:
+                self._agreement.filters(sender, frames)
             self._channels.serve(frames, self._now())
         limit = CHUNK
         while limit:

@@ -128,8 +128,12 @@ class Outbox:
     keeps_withdrawn = False
     """Whether the other ends see for themselves that the owner of a frame was lost."""
 
-    def keep(self, batch: OutgoingBatch) -> None:
-        """Note samples of a lost bus, which are not on this bus, for whoever shows them."""
+    def keep(self, entry: OutgoingBatch | RemovedFrame) -> None:
+        """Note what another link knows and is not, or no more, on this bus, for whoever shows it."""
+
+    def kept(self) -> Iterable[OutgoingBatch | RemovedFrame]:
+        """All that is known by this link, for another one that begins later."""
+        return ()
 
     def own_sample(self, _frame: str, /) -> TransformStamped | None:
         """The newest sample of a frame that this bus has to say again if somebody has outnumbered it."""

@@ -152,7 +152,7 @@ class Relay:
         self._passed: PassedSamples | None = None
 
     def attach(self, outbox: Outbox, foreign: bool = False) -> None:
-        """Give a link all that is latched, and all that is published from now on.
+        """Give a link all that is latched or known by others, and all that is published from now on.
 
         Parameters
         ----------
@@ -168,6 +168,9 @@ class Relay:
             self._passed = PassedSamples()
         if not self._outboxes:
             self._registration = self._bus.subscribe(self._on_batch, self._on_removal)
+        for other in self._outboxes:
+            for entry in other.kept():
+                outbox.keep(entry)
         self._bus.subscribe(lambda batch: self._send_latched(batch, outbox)).close()
         self._outboxes.append(outbox)
 
@@ -344,13 +347,12 @@ class Relay:
                     self._release(origin, frame)
 
     def mask(self, provenance: Provenance, samples: Sequence[TransformStamped]) -> None:
-        """Withdraw frames of which a lost bus was the last to speak, but say again which of them are this bus's own."""
+        """Withdraw frames of which a lost bus was the last to speak, until a way leads to it or others speak."""
         self._number = max(self._number, provenance.sequence)
         for outbox in self._outboxes:
             if outbox is not provenance.outbox:
                 outbox.keep(OutgoingBatch(provenance.origin, provenance.sequence, samples))
         frames = sorted({sample.child for sample in samples})
-        self.say_again(frames)
         for frame in frames:
             latest = self._latest.get(frame)
             if not self._bus.closed and latest is not None and latest.rank < provenance.rank:

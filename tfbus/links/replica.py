@@ -29,6 +29,7 @@ Each copy numbers its own changes: its *sequence* (as Syncthing does). An entry 
 entries, so a frame that moves many times a second does not make copies differ.
 
 1. A sign with the digest of one's own copy needs nothing: what that copy holds up to its sequence is here.
+   A copy of some frames only is compared over these, once its link has asked for them.
 2. Where digests differ, and the other sequence is beyond what is known of that copy, the link asks it a little later,
    if they differ still. A missing number among the live messages is a reason to ask it soon, whatever the digests.
 3. There is one question at a time. Answers are bounded, and the next one is asked for behind the last, up to the
@@ -279,6 +280,11 @@ class Replica:
                 found.append(_told(frame, entry))
         return found
 
+    def told(self) -> Iterator[OutgoingBatch | RemovedFrame]:
+        """All entries."""
+        for frame, entry in self.entries.items():
+            yield _told(frame, entry)
+
     def moving(self) -> list[str]:
         """The moving frames that this link brings to the domain, sorted."""
         return sorted(
@@ -389,10 +395,12 @@ def _told(frame: str, entry: Entry) -> OutgoingBatch | RemovedFrame:
 class _Copy:
     """The copy of one peer, as far as it is known."""
 
-    __slots__ = ("again", "claim", "due", "fruitless", "missed", "must_ask", "replica", "seen", "silences")
+    __slots__ = ("again", "claim", "due", "frames", "fruitless", "missed", "must_ask", "replica", "seen", "silences")
 
     def __init__(self, replica: Replica, seen: int, must_ask: bool) -> None:
         self.replica = replica
+        # The frames that it is about, if it is of some only.
+        self.frames: Collection[str] | None = None
         # It is asked again then, if no sign comes before, because it may not serve the filter.
         self.again = inf
         self.must_ask = must_ask
@@ -434,6 +442,12 @@ class Agreement:
             self._is_new = False
             copy.due, copy.missed = now, True
 
+    def filters(self, peer: str, frames: Collection[str]) -> None:
+        """The copy of a peer is of these frames only, which are among those of the own copy."""
+        copy = self._copies.get(peer)
+        if copy is not None:
+            copy.frames = frames
+
     def left(self, peer: str) -> None:
         """Follow the copy of a peer no more."""
         copy = self._copies.pop(peer, None)
@@ -448,7 +462,9 @@ class Agreement:
     def told(self, peer: str, claim: Claim, now: float, soon: bool = False) -> None:
         """A sign of a peer says what its copy is; with `soon`, what is missing is to be asked for at once."""
         copy = self._copies.get(peer)
-        if copy is None or claim.partial or (copy.claim is not None and claim.sequence < copy.claim.sequence):
+        if copy is None or (claim.partial and copy.frames is None):
+            return
+        if copy.claim is not None and claim.sequence < copy.claim.sequence:
             return
         copy.claim = claim
         copy.again = now + _ASK_AGAIN if copy.must_ask else inf
@@ -519,7 +535,7 @@ class Agreement:
         return min(map(self._due_of, self._copies), default=inf)
 
     def _agrees(self, copy: _Copy, now: float) -> bool:
-        return copy.claim is not None and copy.claim.digest == copy.replica.claim(now).digest
+        return copy.claim is not None and copy.claim.digest == copy.replica.claim(now, copy.frames).digest
 
     def _fail(self, copy: _Copy, now: float) -> None:
         copy.silences = min(copy.silences + 1, 10)

@@ -25,3 +25,14 @@ async def test_a_link_that_hears_a_robot_at_a_rate_of_0_has_its_lookups_and_none
                         await until(lambda: "odom" in all_frames.tree.frames())
                 assert heard.tree.frames() == []
                 assert link.statistics().received_samples == 0
+
+
+async def test_a_link_tells_also_what_other_links_of_its_bus_have_heard_before_it_began() -> None:
+    near, far = new_domain(), new_domain()
+    with Bus() as one, Bus() as bridge, Buffer(bridge) as between, Bus() as other, Buffer(other) as beyond:
+        sender = TransformBroadcaster(one, authority="driver")
+        async with LocalLink(one, near), LocalLink(bridge, near), LocalLink(other, far):
+            sender.send("map", "odom", Transform((1.0, 0.0, 0.0)))
+            await until(lambda: "odom" in between.tree.frames())
+            async with LocalLink(bridge, far):
+                await until(lambda: "odom" in beyond.tree.frames())
