@@ -475,6 +475,7 @@ class DomainEnd(Endpoint):
     # Presence
 
     def _lose(self, peer: Peer) -> tuple[str, ...]:
+        self._end_history(peer.id, peer)
         lost = self._forget(peer)
         frames = tuple(self.relay.frames_of(lost))
         if self.drop_lost:
@@ -583,9 +584,9 @@ class DomainEnd(Endpoint):
             if not goes_on:
                 self._end_history(peer.id)
 
-    def _end_history(self, peer: str) -> None:
-        """Publish what waited for the past of a peer, with it or without it."""
-        known = self.peers.get(peer)
+    def _end_history(self, peer: str, lost: Peer | None = None) -> None:
+        """Publish what waited for the past of a peer, with it or without it; the peer may be lost."""
+        known = lost or self.peers.get(peer)
         if self._history is not None and self._history.is_open(peer):
             held = self._history.end(peer)
             if known is not None:
