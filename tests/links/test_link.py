@@ -1,7 +1,7 @@
 import asyncio
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import count, pairwise
 from typing import Any
 
@@ -9,18 +9,15 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
+from support.foreign_world import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
 from support.processes import until
 from support.samples import moving, static
-from support.wires import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld, WireCarrier
-from tfbus.links._carrier import SendReport
-from tfbus.links._entries import OutgoingBatch
-from tfbus.links._inbox import ReceivedMessage
-from tfbus.links._message import MAX_SAMPLES, MessageWriter, read_message_in_parts
-from tfbus.links._outbox import Turn
-from tfbus.links._receive_queue import Presence, Received
 
 from tfbus import Bus, BusClosedError, PeerJoined, PeerLost, PeerRejected, SimulatedClock
-from tfbus.links import Link, _endpoint
+from tfbus.links import Link
+from tfbus.links.carrier import Presence, Received, ReceivedMessage, SendReport
+from tfbus.links.endpoint import ForeignEnd
+from tfbus.links.outbox import Turn
 from tfbus.tf_message import MalformedMessageError
 
 pytestmark = pytest.mark.anyio
@@ -72,6 +69,18 @@ class LoggedCarrier(ForeignCarrier):
         await super().close()
 
 
+def link_of(
+    bus: Bus,
+    carrier: ForeignCarrier,
+    frames: Iterable[str] | None = None,
+    drop_lost: bool = False,
+    max_frames: int = 10_000,
+    **options: Any,
+) -> Link:
+    """A link to a foreign world."""
+    return Link(ForeignEnd(bus, "world", carrier, frames, drop_lost, max_frames), **options)
+
+
 def slow_clock(step: float) -> Callable[[], float]:
     """A monotonic clock for which so many s pass from one look to the next."""
     looks = count()
@@ -90,7 +99,7 @@ async def test_a_link_between_a_bus_and_a_foreign_world_works_both_ways() -> Non
         bus.publish(static("map", "camera"))
         heard: list[Any] = []
         bus.subscribe(heard.append)
-        async with Link(bus, "world", ForeignCarrier(world)) as link:
+        async with link_of(bus, ForeignCarrier(world)) as link:
             world.say(ARM)
             await receive_samples(link, 2)
             bus.publish(moving("map", "base", 7, 3.0))
@@ -114,7 +123,7 @@ async def test_a_link_between_a_bus_and_a_foreign_world_works_both_ways() -> Non
 async def test_samples_of_one_turn_go_out_together_and_a_full_turn_at_once() -> None:
     carrier = LoggedCarrier()
     with Bus() as bus:
-        async with Link(bus, "world", carrier):
+        async with link_of(bus, carrier):
             for stamp in range(10):
                 bus.publish([moving("map", "a", stamp), moving("map", "b", stamp)])
             assert carrier.calls == ["open"]
@@ -131,7 +140,7 @@ async def test_samples_of_one_turn_go_out_together_and_a_full_turn_at_once() -> 
 async def test_a_link_tells_its_name_and_how_many_peers_it_has() -> None:
     carrier, told = LoggedCarrier(), list[str]()
     with Bus() as bus:
-        link = Link(bus, "world", carrier)
+        link = link_of(bus, carrier)
         assert link.statistics().queue.capacity == 10_000
         told.append(repr(link))
         async with link:
@@ -146,9 +155,10 @@ async def test_a_link_tells_its_name_and_how_many_peers_it_has() -> None:
     ]
 
 
+@pytest.mark.every_loop
 async def test_a_link_is_entered_once() -> None:
     with Bus() as bus:
-        link = Link(bus, "world", LoggedCarrier())
+        link = link_of(bus, LoggedCarrier())
         async with link:
             with pytest.raises(RuntimeError, match="entered once"):
                 await link.__aenter__()
@@ -160,11 +170,11 @@ async def test_a_closed_bus_and_the_bus_of_another_thread_cannot_be_linked() -> 
     closed, carrier = Bus(), LoggedCarrier()
     closed.close()
     with pytest.raises(BusClosedError):
-        await Link(closed, "world", carrier).__aenter__()
+        await link_of(closed, carrier).__aenter__()
 
     async def enter(bus: Bus) -> None:
         with pytest.raises(RuntimeError, match="thread"):
-            await Link(bus, "world", carrier).__aenter__()
+            await link_of(bus, carrier).__aenter__()
 
     with Bus() as bus, bus.threadsafe():
         # This event loop has a claim on the bus now.
@@ -174,29 +184,30 @@ async def test_a_closed_bus_and_the_bus_of_another_thread_cannot_be_linked() -> 
 
 async def test_arguments_that_make_no_sense_are_refused() -> None:
     with pytest.raises(TypeError, match="'base'"):
-        Link(Bus(), "world", LoggedCarrier(), frames="base")
+        link_of(Bus(), LoggedCarrier(), frames="base")
     with pytest.raises(ValueError, match="capacity"):
-        Link(Bus(), "world", LoggedCarrier(), capacity=0)
+        link_of(Bus(), LoggedCarrier(), capacity=0)
     with pytest.raises(ValueError, match="max_frames"):
-        Link(Bus(), "world", LoggedCarrier(), max_frames=0)
+        link_of(Bus(), LoggedCarrier(), max_frames=0)
 
 
 async def test_a_carrier_that_cannot_open_is_closed_and_the_bus_is_as_before() -> None:
     carrier = LoggedCarrier(fails="open")
     with Bus() as bus:
         with pytest.raises(MineError):
-            await Link(bus, "world", carrier).__aenter__()
+            await link_of(bus, carrier).__aenter__()
         assert carrier.calls == ["open", "close"]
         bus.publish(moving("map", "a", 1))
-        async with Link(bus, "world", LoggedCarrier()):
+        async with link_of(bus, LoggedCarrier()):
             pass
 
 
+@pytest.mark.every_loop
 async def test_a_link_that_is_cancelled_while_it_opens_closes_its_carrier() -> None:
     carrier = LoggedCarrier()
     with Bus() as bus, anyio.CancelScope() as scope:
         scope.cancel()
-        async with Link(bus, "world", carrier):
+        async with link_of(bus, carrier):
             pass
     assert scope.cancelled_caught
     assert carrier.calls == ["open", "close"]
@@ -207,7 +218,7 @@ async def test_what_comes_while_the_carrier_opens_is_published_when_the_link_has
     message = Received("driver", ForeignMessage(False, [ARM]))
     carrier.while_opening = lambda: carrier.receive(message)
     with Bus() as bus:
-        async with Link(bus, "world", carrier) as link:
+        async with link_of(bus, carrier) as link:
             await receive_samples(link, 1)
             assert bus.statistics().frames == 1
 
@@ -217,14 +228,14 @@ async def test_a_bus_that_closes_while_the_carrier_opens_is_not_linked() -> None
     bus = Bus()
     carrier.while_opening = bus.close
     with pytest.raises(BusClosedError):
-        await Link(bus, "world", carrier).__aenter__()
+        await link_of(bus, carrier).__aenter__()
     assert carrier.calls == ["open", "close"]
 
 
 async def test_the_error_of_the_body_comes_out_as_it_is_and_the_last_turn_goes_out() -> None:
     carrier = LoggedCarrier()
     with Bus() as bus, pytest.raises(MineError) as caught:
-        async with Link(bus, "world", carrier):
+        async with link_of(bus, carrier):
             await until(lambda: "run" in carrier.calls)
             bus.publish(moving("map", "a", 1))
             raise MineError
@@ -244,7 +255,7 @@ async def test_what_was_published_last_goes_out_while_the_carrier_still_runs() -
 
     carrier = EndingCarrier()
     with Bus() as bus:
-        async with Link(bus, "world", carrier):
+        async with link_of(bus, carrier):
             await until(lambda: "run" in carrier.calls)
             bus.publish(moving("map", "a", 1))
     assert carrier.calls == ["open", "run", "send 1", "end", "close"]
@@ -253,15 +264,16 @@ async def test_what_was_published_last_goes_out_while_the_carrier_still_runs() -
 async def test_an_error_of_the_running_carrier_ends_the_body_and_comes_out_as_it_is() -> None:
     carrier = LoggedCarrier(fails="run")
     with Bus() as bus, pytest.raises(MineError):
-        async with Link(bus, "world", carrier):
+        async with link_of(bus, carrier):
             await anyio.sleep_forever()
     assert carrier.calls[-1] == "close"
 
 
+@pytest.mark.every_loop
 async def test_a_cancelled_body_closes_the_carrier() -> None:
     carrier = LoggedCarrier()
     with Bus() as bus, anyio.CancelScope() as scope:
-        async with Link(bus, "world", carrier):
+        async with link_of(bus, carrier):
             scope.cancel()
             await anyio.sleep_forever()
     assert scope.cancelled_caught
@@ -271,7 +283,7 @@ async def test_a_cancelled_body_closes_the_carrier() -> None:
 async def test_threads_may_bring_messages_in_any_number_and_the_loop_has_time_for_others() -> None:
     carrier = LoggedCarrier()
     with Bus() as bus:
-        async with Link(bus, "world", carrier, now=slow_clock(0.0001)) as link:
+        async with link_of(bus, carrier, now=slow_clock(0.0001)) as link:
 
             def bring() -> None:
                 for stamp in range(2_000):
@@ -309,7 +321,7 @@ class SplittingForeignCarrier(LoggedCarrier):
 async def test_a_message_that_its_carrier_splits_takes_several_turns_and_is_counted_once() -> None:
     carrier = SplittingForeignCarrier(fails="broken")
     with Bus() as bus:
-        async with Link(bus, "world", carrier, now=slow_clock(0.001)) as link:
+        async with link_of(bus, carrier, now=slow_clock(0.001)) as link:
             many = [ARM._replace(child=f"arm{number}", stamp=1) for number in range(50)]
             carrier.receive(Received("driver", ForeignMessage(False, [*many, ARM._replace(child="broken"), ARM])))
             carrier.receive(Received("driver", ForeignMessage(False, [ARM._replace(stamp=2)])))
@@ -325,7 +337,7 @@ async def test_a_message_that_its_carrier_splits_takes_several_turns_and_is_coun
 async def test_the_rest_of_a_split_message_is_dropped_when_the_clock_jumps_back() -> None:
     clock, carrier = SimulatedClock(start=10), SplittingForeignCarrier()
     with Bus(clock) as bus:
-        async with Link(bus, "world", carrier, now=slow_clock(0.001)) as link:
+        async with link_of(bus, carrier, now=slow_clock(0.001)) as link:
             many = [ARM._replace(child=f"arm{number}") for number in range(50)]
             carrier.receive(Received("driver", ForeignMessage(False, many), moving=True))
             while link.statistics().received_samples < 5:
@@ -336,55 +348,10 @@ async def test_the_rest_of_a_split_message_is_dropped_when_the_clock_jumps_back(
             assert link.statistics().received_samples < 50
 
 
-class PartsCarrier(LoggedCarrier):
-    """Reads messages of links of tfbus, large ones in parts."""
-
-    def split(self, content: Any) -> Iterator[Any]:
-        return read_message_in_parts(*content)
-
-    def read(self, content: Any) -> ReceivedMessage:
-        return content  # type: ignore[no-any-return]
-
-
-@pytest.mark.parametrize(("batches", "samples", "turns"), [(1, MAX_SAMPLES, 20), (4_000, 1, 20)])
-async def test_a_large_message_between_links_takes_many_turns_and_each_batch_of_it_is_seen_whole(
-    batches: int, samples: int, turns: int
-) -> None:
-    carrier, heard = PartsCarrier(), []
-    entries = [
-        OutgoingBatch(b"an origin, a bus", n, tuple(moving("map", f"f{n}/{i}", 1) for i in range(samples)))
-        for n in range(batches)
-    ]
-    (message,) = MessageWriter(SendReport(print)).write(entries)
-    # A second look at the clock ends a turn.
-    with Bus(SimulatedClock()) as bus:
-        bus.subscribe(lambda batch: heard.append(len(batch)))
-        async with Link(bus, "world", carrier, now=slow_clock(0.0005)) as link:
-            carrier.receive(Received("peer", (message.payload, message.attachment)))
-            taken = 0
-            while sum(heard) < batches * samples:
-                taken += 1
-                await anyio.lowlevel.checkpoint()
-            assert link.statistics().received_messages == 1
-    assert heard == [samples] * batches
-    assert taken >= turns
-
-
-async def test_nothing_of_a_large_message_that_is_malformed_at_its_end_is_taken() -> None:
-    carrier = PartsCarrier()
-    batch = OutgoingBatch(b"an origin, a bus", 1, tuple(moving("map", f"f{number}", 1) for number in range(1_000)))
-    (message,) = MessageWriter(SendReport(print)).write([batch])
-    with Bus() as bus:
-        async with Link(bus, "world", carrier) as link:
-            carrier.receive(Received("peer", (message.payload + bytes(8), message.attachment)))
-            await until(lambda: link.statistics().rejected == {"oversized": 1})
-            assert bus.statistics().samples == 0
-
-
 async def test_messages_beyond_the_capacity_are_dropped_and_counted() -> None:
     carrier = LoggedCarrier()
     with Bus() as bus:
-        async with Link(bus, "world", carrier, capacity=10) as link:
+        async with link_of(bus, carrier, capacity=10) as link:
             for stamp in range(25):
                 carrier.receive(Received("driver", ForeignMessage(False, [ARM._replace(stamp=stamp)]), moving=True))
             assert (link.statistics().queue.pending, link.statistics().queue.dropped) == (10, 15)
@@ -394,7 +361,7 @@ async def test_messages_beyond_the_capacity_are_dropped_and_counted() -> None:
 async def test_moving_items_that_wait_when_the_clock_jumps_back_are_dropped() -> None:
     clock, carrier = SimulatedClock(start=10), LoggedCarrier()
     with Bus(clock) as bus:
-        async with Link(bus, "world", carrier) as link:
+        async with link_of(bus, carrier) as link:
             for is_static in (False, True):
                 message = ForeignMessage(is_static, [ARM._replace(child=f"{is_static}")])
                 carrier.receive(Received("driver", message, moving=not is_static))
@@ -410,7 +377,7 @@ async def test_moving_items_that_wait_when_the_clock_jumps_back_are_dropped() ->
 async def test_a_sample_that_comes_once_more_is_news_again_when_the_clock_has_jumped_back() -> None:
     clock, carrier = SimulatedClock(start=10), LoggedCarrier()
     with Bus(clock) as bus:
-        async with Link(bus, "world", carrier) as link:
+        async with link_of(bus, carrier) as link:
             counts = []
             for now in (10, 20, 20, 5):
                 clock.set(now)
@@ -423,7 +390,7 @@ async def test_a_sample_that_comes_once_more_is_news_again_when_the_clock_has_ju
 async def test_presence_and_refusals_are_announced_under_the_name_of_the_link() -> None:
     carrier = LoggedCarrier(fails="broken")
     with Bus() as bus, bus.events(stale_after=None) as events:
-        async with Link(bus, "world", carrier, drop_lost=True) as link:
+        async with link_of(bus, carrier, drop_lost=True) as link:
             message = ForeignMessage(False, [ARM])
             broken = ForeignMessage(False, [ARM._replace(child="broken")])
             for content in (Presence.JOINED, message, broken, Presence.JOINED):
@@ -449,39 +416,17 @@ async def test_presence_and_refusals_are_announced_under_the_name_of_the_link() 
 async def test_the_frames_of_a_lost_peer_stay_unless_they_are_to_be_dropped() -> None:
     carrier = LoggedCarrier()
     with Bus() as bus:
-        async with Link(bus, "world", carrier) as link:
+        async with link_of(bus, carrier) as link:
             for content in (Presence.JOINED, ForeignMessage(False, [ARM]), Presence.LEFT):
                 carrier.receive(Received("driver", content))
             await until(lambda: link.statistics().queue.pending == 0)
             assert (link.peers, bus.statistics().frames) == ((), 1)
 
 
-class AskingCarrier(WireCarrier):
-    """Takes what its link receives from a test, and tells whom the link asks."""
-
-    def __init__(self) -> None:
-        self.asked: list[str] = []
-        super().__init__("mine", lambda _: None, lambda peer, _: self.asked.append(peer), dict)
-
-    async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
-        self.receive = receive
-        await super().open(receive, report)
-
-
-async def test_a_peer_that_comes_while_a_link_rests_is_asked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_endpoint, "CLAIM_PERIOD", 1_000.0)
-    carrier = AskingCarrier()
-    with Bus() as bus:
-        async with Link(bus, "wire", carrier):
-            await anyio.wait_all_tasks_blocked()
-            carrier.receive(Received("peer", Presence.JOINED))
-            await until(lambda: carrier.asked == ["peer"])
-
-
 async def test_only_wanted_frames_go_out_and_come_in() -> None:
     world = ForeignWorld()
     with Bus() as bus:
-        async with Link(bus, "world", ForeignCarrier(world), frames=iter(["arm", "base"])) as link:
+        async with link_of(bus, ForeignCarrier(world), frames=iter(["arm", "base"])) as link:
             world.say(ARM, ForeignTransform("map", "tool", 1, 0.0))
             await receive_samples(link, 1)
             bus.publish([moving("map", "base", 1), moving("map", "lidar", 1)])
@@ -495,7 +440,7 @@ def test_items_received_after_a_crash_of_the_event_loop_do_no_harm() -> None:
     message = Received("driver", ForeignMessage(False, [ARM]), moving=True)
 
     async def crash(bus: Bus) -> Link:
-        link = Link(bus, "world", carrier)
+        link = link_of(bus, carrier)
         await link.__aenter__()
         return link
 
@@ -519,7 +464,7 @@ async def test_what_is_not_sent_is_counted_each_time_and_logged_once(caplog: pyt
                 report.refused("frame name", ValueError("the name is too long"))
 
     with Bus() as bus, caplog.at_level(logging.WARNING, "tfbus"):
-        async with Link(bus, "world", RefusingCarrier()) as link:
+        async with link_of(bus, RefusingCarrier()) as link:
             assert link.statistics().not_sent == {"frame name": 2}
     assert caplog.messages == ["not sent over the link world: the name is too long"]
 
@@ -529,7 +474,7 @@ async def test_a_link_tells_no_time_that_it_is_not_to_tell() -> None:
     told: list[int | None] = []
     carrier.send = lambda turn: told.append(turn.time)  # type: ignore[method-assign]
     with Bus(clock) as bus:
-        async with Link(bus, "world", carrier):
+        async with link_of(bus, carrier):
             clock.set(1_000)
             bus.publish(moving("map", "a", 1))
             await until(lambda: bool(told))
@@ -541,7 +486,7 @@ async def test_a_link_tells_the_time_that_it_finds_although_the_clock_stands_sti
     told: list[int | None] = []
     carrier.send = lambda turn: told.append(turn.time)  # type: ignore[method-assign]
     with Bus(clock) as bus:
-        async with Link(bus, "world", carrier, tell_clock=True):
+        async with link_of(bus, carrier, tell_clock=True):
             await anyio.wait_all_tasks_blocked()
             assert told == [7]
 
@@ -550,14 +495,14 @@ async def test_a_link_drives_a_clock_that_follows_and_tells_the_time_of_its_own(
     clock = SimulatedClock()
     followers: list[int] = []
     with Bus(clock) as bus, pytest.raises(TypeError, match="needs a SimulatedClock"):
-        Link(Bus(), "world", LoggedCarrier(), tell_clock=True)
+        link_of(Bus(), LoggedCarrier(), tell_clock=True)
     clock.on_move(followers.append)
     carrier = LoggedCarrier()
     told: list[int | None] = []
     carrier.send = lambda turn: told.append(turn.time)  # type: ignore[method-assign]
     carrier.read = lambda content: ReceivedMessage([], time=content)  # type: ignore[method-assign, arg-type]
     with Bus(clock) as bus:
-        async with Link(bus, "world", carrier, clock=clock, tell_clock=True):
+        async with link_of(bus, carrier, clock=clock, tell_clock=True):
             carrier.receive(Received("robot", Presence.JOINED))
             carrier.receive(Received("robot", 1_000))
             await until(lambda: clock.now() == 1_000)

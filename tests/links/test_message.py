@@ -121,7 +121,7 @@ batches = st.builds(
     OutgoingBatch,
     st.sampled_from((ONE, OTHER)),
     NUMBERS,
-    st.lists(some.samples(at=some.stamps(0, 2**31 * SECOND - 1)), max_size=4),
+    st.lists(some.samples(at=some.stamps(0, 2**31 * SECOND - 1)), min_size=1, max_size=4),
 )
 claims = st.builds(
     lambda one, other, digest, final, partial: Claim(min(one, other), max(one, other), digest, final, partial),

@@ -14,7 +14,6 @@ from support.domains import Network, Stranger, World
 from support.samples import moving, static
 
 from tfbus import PeerLost, PeerRejected, TransformStamped
-from tfbus.links.channels import MOST_FILTERS
 from tfbus.links.message import Kind, Outgoing, read_message, write_body, write_message, write_text
 from tfbus.links.outbox import OutgoingBatch, RemovedFrame
 from tfbus.links.peers import MAX_AUTHORITIES, MAX_PEERS
@@ -132,12 +131,11 @@ def test_what_comes_again_or_late_is_counted_and_what_this_bus_has_said_is_no_ne
     assert scene.told() == [], "nothing was said again"
 
 
-def test_a_batch_and_a_message_of_nothing_call_no_subscriber() -> None:
+def test_a_message_of_nothing_calls_no_subscriber() -> None:
     scene = Scene()
     scene.stranger.say()
-    scene.say(number=1)
     assert scene.process.batches == []
-    assert scene.process.end.messages == 2
+    assert scene.process.end.messages == 1
 
 
 def test_the_batches_of_a_message_are_published_one_by_one_and_those_of_an_answer_as_one() -> None:
@@ -156,13 +154,13 @@ def test_the_batches_of_a_message_are_published_one_by_one_and_those_of_an_answe
 def test_a_number_that_no_bus_can_have_given_is_refused_and_later_ones_are_news() -> None:
     scene = Scene()
     scene.say(moving("map", "a", 1), number=7)
-    for number in (2**64 - 1 - scene.first, 7 + LARGEST_JUMP + 1):
+    for number in (2**64 - 1 - scene.first, LARGEST_JUMP + 10**9):
         scene.say(moving("map", "a", 2), moving("map", "b", 2), number=number)
         scene.remove("a", number=number)
     assert scene.rejected == {"number": 6}
     assert scene.frames == {"a"}
     scene.say(moving("map", "a", 3), number=8)
-    scene.say(moving("map", "a", 4), number=8 + LARGEST_JUMP)
+    scene.say(moving("map", "a", 4), number=LARGEST_JUMP)
     assert scene.counts == (3, 0)
 
 
@@ -262,7 +260,7 @@ def test_invalid_samples_are_counted_by_reason_and_the_rest_of_their_batch_is_pu
             data.replace(struct.pack("<d", 7.5), struct.pack("<d", math.inf)).replace(b"cc\0", b"mm\0")
         )
     assert scene.process.seen == samples[:1]
-    assert scene.rejected == {"not finite": 2, "same frame": 2}
+    assert scene.rejected == {"not finite": 2, "self transform": 2}
     # What only the bus can judge, it refuses.
     scene = Scene()
     scene.say(static("a", "b"), static("b", "c"), number=1)
@@ -349,7 +347,7 @@ def test_a_subscriber_that_raises_hears_all_the_same_and_one_that_closes_the_bus
     scene.say(static("map", "b"), number=3)
     assert (scene.frames, scene.rejected) == ({"b"}, {})
     assert scene.process.bus.statistics().callbacks_failed == 3
-    scene.process.bus.subscribe(lambda _: scene.process.bus.close())
+    scene.process.bus.subscribe(lambda batch: batch[0].child == "10" and scene.process.bus.close())
     batches = [OutgoingBatch(HERE, scene.first + n, [static("map", f"{n}")]) for n in range(10, 13)]
     scene.stranger.say(*batches, RemovedFrame(HERE, scene.first + 20, "b"))
     assert scene.frames == {"b", "10"}
@@ -397,13 +395,6 @@ def test_a_question_is_answered_with_what_this_link_brings_and_a_bad_one_is_refu
         scene.stranger.say_bytes(write_text(Kind.PAST_QUESTION, fields))
     assert scene.rejected == {"text": len(bad) + len(pasts)}
     assert len(scene.stranger.heard(Kind.ANSWER)) == 3
-
-
-def test_so_many_filters_are_served_and_more_are_refused_and_counted() -> None:
-    scene = Scene()
-    for number in range(MOST_FILTERS + 3):
-        scene.stranger.say_bytes(write_text(Kind.QUESTION, {"since": 0, "frames": [f"{number}"]}))
-    assert scene.rejected == {"too many filters": 3}
 
 
 def test_an_answer_about_the_past_that_nobody_has_asked_for_changes_nothing() -> None:
@@ -466,7 +457,7 @@ entries_of_any_kind = st.lists(
         OutgoingBatch,
         st.sampled_from((HERE, OTHER)),
         st.integers(0, 5) | st.integers(0, 2**64 - 1),
-        st.lists(some.samples(names=st.sampled_from("abcd"), at=st.integers(0, 9)), max_size=3),
+        st.lists(some.samples(names=st.sampled_from("abcd"), at=st.integers(0, 9)), min_size=1, max_size=3),
     ),
     max_size=4,
 )

@@ -351,7 +351,7 @@ class Process:
         """Publish a sample with a stamp that nobody else uses."""
         stamp = int(self.world.now * SECOND) + len(self.world.published)
         self.world.published.add((frame, stamp))
-        self.say(TransformStamped("map", frame, stamp, Transform(), self.wires[0].id[:4], static))
+        self.say(TransformStamped("map", frame, stamp, Transform(), self.wire.id[:4], static))
 
     def say(self, *samples: TransformStamped) -> None:
         """Publish a batch, and end the turn."""

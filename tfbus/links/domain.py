@@ -539,6 +539,7 @@ class DomainEnd(Endpoint):
             self._take(link, self._waiting.pop(link))
 
     def _lose(self, peer: Peer) -> tuple[str, ...]:
+        self._end_history(peer.id, peer)
         lost = self._forget(peer)
         frames = tuple(self.relay.frames_of(lost))
         if self.drop_lost:
@@ -648,9 +649,9 @@ class DomainEnd(Endpoint):
             if not goes_on:
                 self._end_history(peer.id)
 
-    def _end_history(self, peer: str) -> None:
-        """Publish what waited for the past of a peer, with it or without it."""
-        known = self.peers.get(peer)
+    def _end_history(self, peer: str, lost: Peer | None = None) -> None:
+        """Publish what waited for the past of a peer, with it or without it; the peer may be lost."""
+        known = lost or self.peers.get(peer)
         if self._history is not None and self._history.is_open(peer):
             held = self._history.end(peer)
             if known is not None:

@@ -1,0 +1,229 @@
+"""Links that hear some frames, some robots, or some of them slowly."""
+
+from typing import Any
+
+import pytest
+from support.domains import Network, Process, Stranger, World, agree
+from support.memory_wire import MemoryNetwork
+from support.samples import moving, static
+
+from tfbus import Bus, TransformStamped
+from tfbus.links import DomainLink
+from tfbus.links.channels import LONGEST_FILTER, MOST_FILTERS, filter_name
+from tfbus.links.message import Heard, Kind, read_message, write_text
+from tfbus.links.relay import ReceivedBatch
+
+
+def counts(process: Process) -> dict[str, int]:
+    """How many samples of each frame a bus has heard."""
+    found: dict[str, int] = {}
+    for sample in process.seen:
+        found[sample.child] = found.get(sample.child, 0) + 1
+    return found
+
+
+def read_live(message: bytes) -> list[TransformStamped]:
+    found: list[TransformStamped] = []
+    for part in read_message(message):
+        assert isinstance(part, Heard)
+        for entry in part.entries:
+            assert isinstance(entry, ReceivedBatch)
+            found += entry.samples
+    return found
+
+
+# Frames
+
+
+def test_a_link_for_some_frames_sends_and_takes_these_only_and_peers_send_it_no_others() -> None:
+    world = World()
+    network = Network(world)
+    one = world.process(network)
+    some = world.process(network, frames=["base", "camera", "own"])
+    one.say(static("map", "camera"), static("map", "lidar"))
+    world.run(3.0)
+    network.carried.clear()
+    before = some.end.messages
+    for stamp in range(20):
+        one.say(moving("map", "arm", stamp))
+    assert all(kind is not Kind.LIVE for kind, _ in network.carried)
+    for stamp in range(20):
+        one.say(moving("map", "base", stamp), moving("map", "arm", stamp))
+    some.say(static("map", "own"), static("map", "secret"))
+    some.say(static("map", "secret"))
+    one.remove("lidar")
+    one.remove("camera")
+    world.run(3.0)
+    assert some.frames.keys() == {"base", "own", "secret"}
+    assert counts(some)["base"] == 20
+    assert one.frames.keys() == {"arm", "base", "own"}
+    assert some.end.messages - before <= 25
+    assert (some.end.lost, some.end.peers.rejected) == (0, {})
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_filtered_link_has_its_frames_after_any_loss_and_the_others_theirs_of_it(seed: int) -> None:
+    world = World(seed)
+    network = Network(world)
+    one, other = world.process(network), world.process(network)
+    some = world.process(network, frames=["a", "b", "mine"])
+    world.run(5.0)
+    network.loss = 0.5
+    for number, name in enumerate("abcd" * 20):
+        (one, other)[number % 2].say(static("map", name, float(number)))
+        some.say(static("map", "mine", float(number)))
+        world.run(0.05)
+    other.remove("b")
+    network.heal()
+    world.run(10.0)
+    assert agree([one, other])
+    assert some.frames.keys() == {"a", "mine"}
+    assert [some.frames[name] for name in ("a", "mine")] == [one.frames[name] for name in ("a", "mine")]
+    late = world.process(network, frames=["mine", "c"])
+    world.run(3.0)
+    assert late.frames == {name: one.frames[name] for name in ("mine", "c")}
+    network.carried.clear()
+    world.run(60.0)
+    # Only the two whose filters differ ask each other, now and then.
+    assert network.sent(Kind.QUESTION) <= 4
+
+
+def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_their_frames() -> None:
+    world = World()
+    network = Network(world)
+    one = world.process(network)
+    many = []
+    for number in range(MOST_FILTERS + 5):
+        some = [f"f{number}"]
+        many.append(Stranger(network, channel=filter_name(some)))
+        world.run(0.01)
+        many[-1].send(one.wire.id, write_text(Kind.QUESTION, {"since": 0, "frames": some}))
+        world.run(0.1)
+    long = world.process(network, frames=[f"{number}{'x' * 900}" for number in range(LONGEST_FILTER // 900)] + ["f0"])
+    world.run(1.0)
+    for stamp in range(3):
+        one.say(*(moving("map", f"f{number}", stamp) for number in range(len(many))))
+    world.run(0.1)
+    for number, hearer in enumerate(many):
+        samples = [sample for heard in map(read_live, hearer.heard(Kind.LIVE)) for sample in heard]
+        assert [sample.stamp for sample in samples if sample.child == f"f{number}"] == [0, 1, 2]
+        assert len(samples) == (3 if number < MOST_FILTERS else 3 * len(many))
+    assert counts(long) == {"f0": 3}
+
+
+def test_a_link_for_no_frame_at_all_hears_and_sends_nothing() -> None:
+    world = World()
+    network = Network(world)
+    one, none = world.process(network), world.process(network, frames=[])
+    one.say(static("map", "a"), moving("map", "b", 1))
+    none.say(static("map", "c"))
+    world.run(5.0)
+    assert (one.frames.keys(), none.frames.keys()) == ({"a", "b"}, {"c"})
+
+
+# Robots
+
+
+def test_only_the_robots_that_are_asked_for_are_peers_and_heard() -> None:
+    world = World()
+    network = Network(world)
+    robots = {name: world.process(network, robot=name) for name in ("r1", "r17", "s1")}
+    unnamed = world.process(network)
+    some = world.process(network, robots={"r1": float("inf")})
+    pattern = world.process(network, robots={"r*": float("inf")})
+    for name, process in robots.items():
+        process.say(static("map", name), moving("map", f"{name}/base", 1))
+    unnamed.say(static("map", "unnamed"))
+    world.run(5.0)
+    assert some.frames.keys() == {"r1", "r1/base"}
+    assert pattern.frames.keys() == {"r1", "r1/base", "r17", "r17/base"}
+    assert len(unnamed.frames) == 7
+    assert some.end.peers.present == (robots["r1"].wire.id,)
+    assert len(unnamed.end.peers.present) == 5
+
+
+def test_of_a_slow_robot_come_static_frames_at_once_and_the_newest_of_moving_ones_at_its_rate() -> None:
+    world = World()
+    network = Network(world)
+    robot = world.process(network, robot="r1", slow_rate=5.0)
+    fast, slow = world.process(network), world.process(network, robots={"r1": 2.0})
+    at_most = world.process(network, robots={"r1": 100.0})
+    world.run(5.0)
+    for step in range(1_000):
+        robot.say(moving("map", "base", step), moving("map", "arm", step))
+        world.run(0.01)
+        if step == 500:
+            robot.say(static("map", "camera"))
+            world.run(3.0)
+            assert "camera" in slow.frames
+    assert counts(fast)["base"] == 1_000
+    assert 15 <= counts(slow)["base"] <= 23
+    assert 45 <= counts(at_most)["base"] <= 60, "no more often than the robot's link sends"
+    world.run(3.0)
+    assert slow.frames["base"].stamp == slow.frames["arm"].stamp == 999
+    robot.remove("base")
+    world.run(5.0)
+    assert "base" not in slow.frames
+    assert slow.end.lost == 0
+
+
+def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer() -> None:
+    world = World()
+    network = Network(world)
+    robot = world.process(network, robot="r1")
+    quiet = world.process(network, robots={"r1": 0.0}, history=5.0)
+    robot.say(static("map", "a"))
+    for stamp in range(10):
+        robot.say(moving("map", "b", stamp))
+        world.run(1.0)
+    assert quiet.frames == {}
+    assert quiet.end.peers.present == (robot.wire.id,)
+    assert not quiet.end.peers.rejected
+
+
+def test_what_a_link_publishes_goes_to_each_hearer_in_its_own_way() -> None:
+    world = World()
+    network = Network(world)
+    robot = world.process(network, robot="r1")
+    hearers = [
+        world.process(network),
+        world.process(network, frames=["a"]),
+        world.process(network, robots={"r1": 1.0}),
+        world.process(network, robots={"r1": 1.0, "*": float("inf")}, frames=["a"]),
+        world.process(network, robots={"*": 0.0}),
+    ]
+    world.run(3.0)
+    robot.say(static("map", "a"), static("map", "b"))
+    world.run(5.0)
+    assert [sorted(process.frames) for process in hearers] == [["a", "b"], ["a"], ["a", "b"], ["a"], []]
+    robot.remove("a")
+    world.run(5.0)
+    assert [sorted(process.frames) for process in hearers] == [["b"], [], ["b"], [], []]
+
+
+@pytest.mark.parametrize(
+    ("error", "options"),
+    [
+        (TypeError, {"frames": "base"}),
+        (TypeError, {"robots": "r1"}),
+        (ValueError, {"robots": ["r 1"]}),
+        (ValueError, {"robots": [""]}),
+        (ValueError, {"robots": {"r1": -1.0}}),
+        (ValueError, {"robots": {"r1": float("nan")}}),
+        (ValueError, {"robot": "r/1"}),
+        (ValueError, {"robot": ""}),
+        (ValueError, {"robot": "x" * 201}),
+        (ValueError, {"slow_rate": 0.0}),
+        (ValueError, {"slow_rate": float("inf")}),
+        (ValueError, {"slow_rate": float("nan")}),
+        (ValueError, {"max_frames": 0}),
+        (ValueError, {"capacity": 0}),
+        (TypeError, {"tell_clock": True}),
+        (ValueError, {"domain": "a b"}),
+        (ValueError, {"domain": ""}),
+        (ValueError, {"domain": "/a"}),
+    ],
+)
+def test_arguments_that_make_no_sense_are_refused(error: type[Exception], options: dict[str, Any]) -> None:
+    with pytest.raises(error, match=r"."):
+        DomainLink(Bus(), **{"domain": "tf", "wire": MemoryNetwork().wire(), **options})
