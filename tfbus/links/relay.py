@@ -226,7 +226,7 @@ class Relay:
         for provenance, samples in received:
             if provenance.origin != self.origin:
                 refused += self._find_news(provenance, samples, max_frames, news)
-            elif provenance.sequence > self._number:
+            else:
                 self._outnumber(provenance.sequence, {sample.child for sample in samples})
         if news:
             self._bus.publish(news, invalid="drop")
@@ -251,8 +251,7 @@ class Relay:
     def remove(self, provenance: Provenance, frame: str) -> None:
         """Remove a frame from the bus, unless something newer was said of it."""
         if provenance.origin == self.origin:
-            if provenance.sequence > self._number:
-                self._outnumber(provenance.sequence, {frame})
+            self._outnumber(provenance.sequence, {frame})
             return
         self._number = max(self._number, provenance.sequence)
         latest = self._latest.get(frame)
@@ -516,9 +515,11 @@ class Relay:
         return self._number
 
     def _outnumber(self, number: int, frames: Iterable[str]) -> None:
-        """Skip past a forged number of this bus, and say again what it may have masked."""
-        self._number = number + _LEAP
-        self.say_again(frames)
+        """If a number of this bus is made up, skip past it, and say again what it has masked."""
+        if number > self._number:
+            self._number = number + _LEAP
+        latest = ((frame, self._latest.get(frame)) for frame in frames)
+        self.say_again(frame for frame, known in latest if known is not None and known.sequence < number)
 
 
 def relay_of(bus: Bus) -> Relay:
