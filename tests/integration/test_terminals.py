@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from support import pr2
 from support.commands import lines_on_a_terminal
-from support.processes import free_address, new_domain, start_tfbus
+from support.processes import new_domain, start_tfbus
 from support.recorded import SMALL
 
 from tfbus.cli.output import cells
@@ -39,10 +39,10 @@ def test_the_frames_of_a_robot_fit(urdf: Path, width: int) -> None:
 @pytest.fixture(scope="module", params=URDFS)
 def robot(request: pytest.FixtureRequest) -> Iterator[tuple[Path, tuple[str, ...]]]:
     """The description of a robot that is published, and the options that join its domain."""
-    domain, address = new_domain(), free_address()
-    with start_tfbus("robot", str(request.param), "--domain", domain, "--listen", address) as program:
+    options = ("--domain", new_domain())
+    with start_tfbus("robot", str(request.param), *options) as program:
         program.errors.expect("publishing")
-        yield request.param, ("--domain", domain, "--connect", address)
+        yield request.param, options
 
 
 def test_the_tree_of_a_domain_fits_with_frame_rate_and_age(robot: tuple[Path, tuple[str, ...]], width: int) -> None:
