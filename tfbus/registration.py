@@ -1,7 +1,11 @@
-"""The handle that a registering call returns."""
+"""The handle that a registering call returns, and a warning of what nobody has entered."""
 
+import logging
+import os
 from collections.abc import Callable
 from types import TracebackType
+from typing import Any
+from weakref import finalize
 
 
 class Registration:
@@ -31,3 +35,16 @@ class Registration:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+
+def warn_unless_entered(thing: object) -> "finalize[..., Any]":
+    """Have a line logged when something ends that nobody has entered; to enter it is to `detach` this."""
+    return finalize(thing, _warn_never_entered, type(thing).__name__, os.getpid())
+
+
+def _warn_never_entered(name: str, process: int) -> None:
+    # A child made by `fork` has copies of what its parent is about to enter.
+    if os.getpid() == process:
+        logging.getLogger("tfbus").warning(
+            "a %s was made and never entered, so it has done nothing: write `async with %s(...)`", name, name
+        )

@@ -4,12 +4,14 @@ import subprocess
 import sys
 
 import pytest
+from support.processes import new_domain
 
 BEGIN = """
 import asyncio, multiprocessing, os, sys, tempfile
 import anyio
-from tfbus import Buffer, Bus, TransformBroadcaster, Transform, TransformStamped
-from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink
+from tfbus import Buffer, Bus, LocalLink, TransformBroadcaster, Transform, TransformStamped
+from tfbus.links import BufferServer
+from tfbus.links.zenoh import ZenohLink
 from tfbus.recording import Recorder
 
 def sample(stamp):
@@ -28,6 +30,11 @@ def in_a_child(body):
         sys.stdout.flush()
         os._exit(0)
     os.waitpid(child, 0)
+
+def in_a_process(body):
+    process = multiprocessing.get_context("fork").Process(target=body)
+    process.start()
+    process.join()
 """
 
 
@@ -56,6 +63,7 @@ print(buffer.lookup_nowait("map", "base").stamp)
 
 
 ENTERED = {
+    "LocalLink": "LocalLink(bus, directory=tempfile.mkdtemp())",
     "ZenohLink": "ZenohLink(bus, listen='tcp/127.0.0.1:0')",
     "Recorder": "Recorder(bus, tempfile.mkdtemp() + '/a.tfbus')",
 }
@@ -63,15 +71,10 @@ ENTERED = {
 
 @pytest.mark.parametrize("kind", ENTERED)
 @pytest.mark.parametrize(
-    "started", ["in_a_child(child)", pytest.param("by_multiprocessing(child)", marks=pytest.mark.thorough)]
+    "started", ["in_a_child(child)", pytest.param("in_a_process(child)", marks=pytest.mark.thorough)]
 )
 def test_a_child_is_told_that_nobody_hears_what_it_publishes_on_the_bus_of_its_parent(kind: str, started: str) -> None:
     lines = said(f"""
-def by_multiprocessing(body):
-    process = multiprocessing.get_context("fork").Process(target=body)
-    process.start()
-    process.join()
-
 async def main():
     with Bus(max_ahead=None, max_behind=None) as bus, Buffer(bus) as buffer:
         one, two = TransformBroadcaster(bus), ({ENTERED[kind]})
@@ -118,28 +121,63 @@ anyio.run(main)
     ]
 
 
+LINKS = {"zenoh": "ZenohLink(bus, listen='tcp/127.0.0.1:0')", "local": f"LocalLink(bus, {new_domain()!r})"}
+
+
+@pytest.mark.parametrize("kind", LINKS)
+def test_a_child_cannot_look_up_by_the_link_of_its_parent(kind: str) -> None:
+    lines = said(f"""
+async def main():
+    with Bus(max_behind=None) as bus:
+        async with {LINKS[kind]} as link:
+            in_a_process(lambda: tell(asyncio.run, link.lookup("map", "base")))
+anyio.run(main)
+""")
+    assert [line.partition(",")[0] for line in lines] == ["RuntimeError this process was forked"]
+
+
 def test_a_child_of_a_program_with_zenoh_cannot_enter_a_link_and_ends_without_waiting() -> None:
     lines = said("""
-async def enter(make):
-    async with make():
+async def enter(link):
+    async with link:
         print("entered")
 
 async def main():
-    with Bus(max_behind=None) as bus, Buffer(bus) as buffer:
-        async with ZenohLink(bus, listen="tcp/127.0.0.1:0"), BufferClient(listen="tcp/127.0.0.1:0") as client:
-            def child():
-                own = Bus(max_behind=None)
-                tell(asyncio.run, enter(lambda: ZenohLink(own, listen="tcp/127.0.0.1:0")))
-                tell(asyncio.run, enter(lambda: BufferClient(listen="tcp/127.0.0.1:0")))
-                tell(asyncio.run, client.lookup("map", "base"))
-            process = multiprocessing.get_context("fork").Process(target=child)
-            process.start()
-            process.join()
+    with Bus(max_behind=None) as bus:
+        async with ZenohLink(bus, listen="tcp/127.0.0.1:0"):
+            own = Bus(max_behind=None)
+            in_a_process(lambda: tell(asyncio.run, enter(ZenohLink(own, listen="tcp/127.0.0.1:0"))))
 anyio.run(main)
 """)
     assert [line.partition(",")[0] for line in lines] == [
         "RuntimeError this process was forked from one that uses zenoh"
-    ] * 3
+    ]
+
+
+def test_a_child_of_a_program_with_a_local_link_meets_it_and_the_parent_has_it_still() -> None:
+    lines = said("""
+async def meet(link):
+    async with link:
+        while not link.peers:
+            await anyio.sleep(0.01)
+        print(len(link.peers))
+
+async def main():
+    directory = tempfile.mkdtemp()
+    with Bus(max_behind=None) as bus, Bus() as other:
+        async with LocalLink(bus, directory=directory) as link, LocalLink(other, directory=directory):
+            child = multiprocessing.get_context("fork").Process(
+                target=lambda: tell(asyncio.run, meet(LocalLink(Bus(max_behind=None), directory=directory)))
+            )
+            child.start()
+            await anyio.to_thread.run_sync(child.join)
+            print(len(link.peers))
+            with bus.events() as events:
+                print([type(event).__name__ for event in iter(events.queue.get, None)])
+anyio.run(main)
+""")
+    assert lines[1:] == ["did None", "1", "[]"]
+    assert lines[0] in "12"
 
 
 def test_a_child_that_forks_before_the_first_link_has_links_of_its_own() -> None:
@@ -163,11 +201,13 @@ async def enter(link):
         pass
 entered = ZenohLink(Bus(), listen="tcp/127.0.0.1:0")
 anyio.run(enter, entered)
-tell(anyio.run, enter, ZenohLink(Bus(), config={{"mode": "client"}}, connect="tcp/127.0.0.1:1"))
+tell(anyio.run, enter, ZenohLink(Bus(), listen="tcp/192.0.2.1:1"))
 tell(ZenohLink, Bus(), "no domain")
 # One link goes at once, the program keeps four to its end; the copies in a child are not told of again.
 RmwZenohLink(Bus())
-kept = [ZenohLink(Bus()), RosbridgeLink(Bus(), "ws://127.0.0.1:9090"), BufferServer(Buffer(Bus())), BufferClient()]
+link = LocalLink(Bus())
+kept = [ZenohLink(Bus(), connect="tcp/127.0.0.1:1"), RosbridgeLink(Bus(), "ws://127.0.0.1:9090"), link]
+kept.append(BufferServer(Buffer(link.bus), link))
 in_a_child(lambda: sys.exit())
 """
     command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", program]
@@ -175,5 +215,5 @@ in_a_child(lambda: sys.exit())
     assert [line.split()[0] for line in done.stdout.splitlines()] == ["OSError", "ValueError"]
     assert sorted(done.stderr.splitlines()) == [
         f"a {name} was made and never entered, so it has done nothing: write `async with {name}(...)`"
-        for name in ("BufferClient", "BufferServer", "RmwZenohLink", "RosbridgeLink", "ZenohLink")
+        for name in ("BufferServer", "LocalLink", "RmwZenohLink", "RosbridgeLink", "ZenohLink")
     ]

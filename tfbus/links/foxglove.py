@@ -21,8 +21,7 @@ from tfbus._aio.web_door import HEAD_END, HEAD_TIME, MAX_HEAD, WebDoor
 from tfbus.bus.bus import Bus
 from tfbus.errors import BusClosedError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.links.link import warn_unless_entered
-from tfbus.registration import Registration
+from tfbus.registration import Registration, warn_unless_entered
 from tfbus.stamps import SECOND
 
 try:

@@ -1,14 +1,11 @@
 """The half that all links share: it joins a bus to a network for as long as its ``async with`` lasts."""
 
-import logging
 import math
-import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from time import monotonic
 from types import TracebackType
 from typing import Any, Self, TypedDict
-from weakref import finalize
 
 import anyio
 import anyio.abc
@@ -29,7 +26,7 @@ from tfbus.links.history import LONGEST_HISTORY
 from tfbus.links.lookups import Answers, RemoteLookups
 from tfbus.links.remote_lookup import RemoteQuestion
 from tfbus.links.wire import Wire
-from tfbus.registration import Registration
+from tfbus.registration import Registration, warn_unless_entered
 from tfbus.stamps import LATEST, Latest, as_duration, as_stamp
 from tfbus.statistics import LinkStatistics
 from tfbus.tf_message import MalformedMessageError
@@ -38,19 +35,6 @@ from tfbus.tree.lookup import Hold, policy_of
 _LONGEST_NAME = 200
 _FULL_TURN = 5_000
 """So many samples and removals are sent at once, before the turn of the event loop ends."""
-
-
-def warn_unless_entered(thing: object) -> "finalize[..., Any]":
-    """Have a line logged when something ends that nobody has entered; to enter it is to `detach` this."""
-    return finalize(thing, _warn_never_entered, type(thing).__name__, os.getpid())
-
-
-def _warn_never_entered(name: str, process: int) -> None:
-    # A child made by `fork` has copies of what its parent is about to enter.
-    if os.getpid() == process:
-        logging.getLogger("tfbus").warning(
-            "a %s was made and never entered, so it has done nothing: write `async with %s(...)`", name, name
-        )
 
 
 class Link:
@@ -398,7 +382,8 @@ class DomainLink(Link):
 
     @property
     def lookups(self) -> RemoteLookups:
-        """The lookups of the link; raises `RuntimeError` unless it is entered. For a `BufferServer`."""
+        """The lookups of the link; raises `RuntimeError` unless it is entered, and here. For a `BufferServer`."""
+        self.bus._check_thread()
         if not self._attached:
             raise RuntimeError("the link is not entered")
         return self._domain_end.lookups

@@ -32,6 +32,7 @@ from tfbus.links.remote_lookup import (
     write_answer,
     write_question,
 )
+from tfbus.registration import warn_unless_entered
 from tfbus.statistics import BufferServerStatistics
 from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.lookup import Hold
@@ -300,6 +301,7 @@ class BufferServer:
         self._allowance = self._most_at_once = max(rate, 1.0)
         self._refilled = monotonic()
         self._entered = False
+        self._never_entered = warn_unless_entered(self)
         self._waiting: dict[tuple[str, int], _Waiting] = {}
         self._counts: Counter[str] = Counter()
         self._log = OnceLogger(logging.getLogger("tfbus"))
@@ -321,6 +323,7 @@ class BufferServer:
         if self._entered:
             raise RuntimeError("a buffer server is entered once: make another one")
         self._lookups = self._link.lookups
+        self._never_entered.detach()
         if self._lookups.server is not None:
             raise RuntimeError("this link serves a buffer already")
         self._entered = True
