@@ -174,9 +174,9 @@ def test_a_number_of_this_bus_that_somebody_has_made_up_does_not_hide_what_it_sa
     assert again["s"].samples == [static("map", "s", 1.0)]
     assert {entry.origin for entry in again.values()} == {scene.origin}
     assert min(entry.sequence for entry in again.values()) > scene.first + 500
-    scene.remove("t", origin=scene.origin, number=900)
+    scene.remove("t", origin=scene.origin, number=10**12)
     (said_again,) = scene.told()
-    assert (said_again.samples, said_again.sequence > scene.first + 900) == ([static("map", "t")], True)
+    assert (said_again.samples, said_again.sequence > scene.first + 10**12) == ([static("map", "t")], True)
     scene.process.say(moving("map", "m", 3))
     scene.world.run(0.01)
     assert scene.told()[0].sequence > said_again.sequence
