@@ -211,7 +211,7 @@ async def test_a_server_is_entered_once_with_an_entered_link_that_serves_no_othe
     with Bus() as bus, Buffer(bus) as buffer:
         for options in ({"capacity": 0}, {"rate": 0.0}, {"rate": math.nan}):
             with pytest.raises(ValueError, match=r"."):
-                BufferServer(buffer, DomainLink(bus, "tf", network.wire()), **options)  # type: ignore[arg-type]
+                BufferServer(buffer, DomainLink(bus, "tf", network.wire()), **options)
         link = DomainLink(bus, "tf", network.wire())
         with pytest.raises(RuntimeError, match="not entered"):
             await BufferServer(buffer, link).__aenter__()

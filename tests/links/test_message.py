@@ -142,8 +142,8 @@ outgoing = st.builds(
 )
 
 
-@given(out=outgoing, entries=st.lists(removals | batches, max_size=5))
-def test_a_message_is_read_as_it_was_written(out: Outgoing, entries: list[Entry]) -> None:
+@given(out=outgoing, entries=st.lists(st.one_of(removals, batches), max_size=5))
+def test_a_message_is_read_as_it_was_written(out: Outgoing, entries: list[Any]) -> None:
     data = write_message(out, entries)
     heard = read(data)
     assert kind_of(data) == heard.kind == out.kind

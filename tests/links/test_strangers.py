@@ -347,7 +347,12 @@ def test_a_subscriber_that_raises_hears_all_the_same_and_one_that_closes_the_bus
     scene.say(static("map", "b"), number=3)
     assert (scene.frames, scene.rejected) == ({"b"}, {})
     assert scene.process.bus.statistics().callbacks_failed == 3
-    scene.process.bus.subscribe(lambda batch: batch[0].child == "10" and scene.process.bus.close())
+
+    def close(batch: Sequence[TransformStamped]) -> None:
+        if batch[0].child == "10":
+            scene.process.bus.close()
+
+    scene.process.bus.subscribe(close)
     batches = [OutgoingBatch(HERE, scene.first + n, [static("map", f"{n}")]) for n in range(10, 13)]
     scene.stranger.say(*batches, RemovedFrame(HERE, scene.first + 20, "b"))
     assert scene.frames == {"b", "10"}
