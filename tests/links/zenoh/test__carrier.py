@@ -11,6 +11,7 @@ import pytest
 import zenoh
 from support.processes import PATIENCE, free_ports, new_domain, until
 from support.samples import moving, static
+
 from tfbus.links._carrier import SendReport
 from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
@@ -18,11 +19,10 @@ from tfbus.links._message import Message
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links._state import StateStep
+from tfbus.links.zenoh import _carrier, _closing
 from tfbus.links.zenoh._carrier import ZenohCarrier
 from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._settings import patch_settings, settings
-
-from tfbus.links.zenoh import _carrier, _closing
 
 pytestmark = pytest.mark.anyio
 

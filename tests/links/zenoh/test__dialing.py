@@ -3,6 +3,7 @@ from types import SimpleNamespace
 import anyio
 import pytest
 from support.processes import free_ports
+
 from tfbus.links.zenoh._dialing import (
     FIRST_PAUSE,
     LONG_PAUSE,

@@ -3,6 +3,7 @@ from base64 import urlsafe_b64encode
 
 import pytest
 import zenoh
+
 from tfbus.links.zenoh._filters import LONGEST_FILTER, MOST_FILTERS, Filters, name_of, read_filter, write_filter
 
 FRAMES = ["base_link", "arm/hand", "rad ä*$#?", 'with "quotes"', "\udc80"]

@@ -6,6 +6,7 @@ from uuid import uuid4
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from tfbus.links.zenoh._dialing import Dialing
 from tfbus.links.zenoh._introductions import (
     FIRST_PAUSE,
@@ -19,7 +20,6 @@ from tfbus.links.zenoh._introductions import (
 from tfbus.links.zenoh._keys import FIRST_SESSION, NO_ROBOT, Keys
 from tfbus.links.zenoh._listening import Listening
 from tfbus.links.zenoh._settings import settings
-
 from tfbus.tf_message import MalformedMessageError
 
 

@@ -2,6 +2,7 @@ from itertools import pairwise
 
 import pytest
 import zenoh
+
 from tfbus.links.zenoh._filters import name_of, write_filter
 from tfbus.links.zenoh._keys import (
     ANY_ROBOT,

@@ -1,6 +1,7 @@
 from typing import Any
 
 import pytest
+
 from tfbus.links.zenoh._dialing import MOST_ADDRESSES
 from tfbus.links.zenoh._listening import MOST_CONNECTIONS, Listening
 from tfbus.links.zenoh._settings import MEETING_POINT, settings

@@ -11,9 +11,9 @@ import anyio.to_thread
 import pytest
 import zenoh
 from support.processes import until
-from tfbus.links.zenoh._lookup_session import LookupSession, reply_now
 
 from tfbus.links.zenoh import _closing, _lookup_session
+from tfbus.links.zenoh._lookup_session import LookupSession, reply_now
 
 pytestmark = pytest.mark.anyio
 

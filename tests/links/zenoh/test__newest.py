@@ -1,5 +1,6 @@
 import pytest
 from support.samples import moving, static
+
 from tfbus.links._entries import OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch
 from tfbus.links._message import Message, read_message

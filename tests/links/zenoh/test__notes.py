@@ -6,6 +6,7 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
+
 from tfbus.links._receive_queue import Presence
 from tfbus.links.zenoh._notes import MOST_ASKING, Noted, Notes
 

@@ -2,6 +2,7 @@ import errno
 import socket
 
 import pytest
+
 from tfbus.links.zenoh._opening import directly, open_session
 from tfbus.links.zenoh._settings import settings
 

@@ -3,6 +3,7 @@ from typing import Any
 import anyio
 import pytest
 import zenoh
+
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.zenoh._filters import Filters
 from tfbus.links.zenoh._keys import FIRST_SESSION, NO_ROBOT, Keys

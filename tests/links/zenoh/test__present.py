@@ -3,6 +3,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.zenoh._keys import ANY_ROBOT, FIRST_SESSION, NO_ROBOT
 from tfbus.links.zenoh._present import DIRECT, Present, Way

@@ -3,6 +3,7 @@ from queue import Queue
 import pytest
 import zenoh
 from support.processes import PATIENCE, until
+
 from tfbus.links._message import Message
 from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._opening import directly

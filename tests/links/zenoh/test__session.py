@@ -10,6 +10,7 @@ from uuid import uuid4
 import pytest
 import zenoh
 from support.processes import PATIENCE
+
 from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._message import MAX_BYTES, Message
 from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Question, Received
@@ -17,7 +18,6 @@ from tfbus.links.zenoh._filters import name_of, write_filter
 from tfbus.links.zenoh._keys import FIRST_SESSION, NO_ROBOT, Keys
 from tfbus.links.zenoh._session import MOST_NAMES, MOST_QUESTIONS, ZenohSession
 from tfbus.links.zenoh._settings import settings
-
 from tfbus.tf_message import MalformedMessageError
 
 A, B = uuid4().hex, uuid4().hex

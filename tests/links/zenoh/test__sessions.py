@@ -15,8 +15,10 @@ import anyio.to_thread
 import pytest
 import zenoh
 from support.processes import free_ports, new_domain, until
+
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
+from tfbus.links.zenoh import _sessions
 from tfbus.links.zenoh._dialing import FIRST_PAUSE, Dialing
 from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._hearing import DEAF
@@ -26,8 +28,6 @@ from tfbus.links.zenoh._opening import OpenQuestion
 from tfbus.links.zenoh._sessions import ZenohSessions
 from tfbus.links.zenoh._settings import patch_settings, settings
 from tfbus.links.zenoh._unmet import Unmet
-
-from tfbus.links.zenoh import _sessions
 from tfbus.tf_message import MalformedMessageError
 
 pytestmark = pytest.mark.anyio

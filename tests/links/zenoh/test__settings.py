@@ -11,11 +11,11 @@ import anyio
 import pytest
 from support.processes import crowd, free_ports, new_domain, until
 from support.samples import moving, static
-from tfbus.links._message import MAX_BYTES
-from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, identity, patch_settings, settings
 
 from tfbus import Buffer, Bus
+from tfbus.links._message import MAX_BYTES
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, ZenohRouter, _settings
+from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, identity, patch_settings, settings
 
 LISTEN, CONNECT = "listen/endpoints", "connect/endpoints"
 LOOPBACK = "tcp/127.0.0.1:0"

@@ -4,6 +4,7 @@ from uuid import uuid4
 
 import pytest
 import zenoh
+
 from tfbus.links._receive_queue import Received
 from tfbus.links.zenoh._dialing import MOST_ADDRESSES
 from tfbus.links.zenoh._keys import Keys

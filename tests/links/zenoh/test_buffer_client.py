@@ -11,11 +11,6 @@ import zenoh
 from support.asking import settle
 from support.processes import until
 from support.samples import moving, static
-from tfbus.links._remote_lookup import Cancellation, read_question, write_answer
-from tfbus.links.zenoh._lookup_session import LookupSession
-from tfbus.links.zenoh._settings import settings
-from tfbus.links.zenoh.buffer_client import PATIENCE
-from tfbus.links.zenoh.buffer_server import LONGEST_WAIT
 
 from tfbus import (
     LATEST,
@@ -31,7 +26,12 @@ from tfbus import (
     TransformStamped,
     UnknownFrameError,
 )
+from tfbus.links._remote_lookup import Cancellation, read_question, write_answer
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, buffer_client
+from tfbus.links.zenoh._lookup_session import LookupSession
+from tfbus.links.zenoh._settings import settings
+from tfbus.links.zenoh.buffer_client import PATIENCE
+from tfbus.links.zenoh.buffer_server import LONGEST_WAIT
 
 pytestmark = pytest.mark.anyio
 

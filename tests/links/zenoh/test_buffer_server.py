@@ -13,12 +13,12 @@ import zenoh
 from support.asking import settle
 from support.processes import PATIENCE, until
 from support.samples import static
-from tfbus.links._remote_lookup import Cancellation, RemoteQuestion, read_answer, write_question
-from tfbus.links.zenoh._lookup_session import Failures
-from tfbus.links.zenoh._settings import settings
 
 from tfbus import LATEST, Buffer, Bus, RemoteLookupError, TransformStamped
+from tfbus.links._remote_lookup import Cancellation, RemoteQuestion, read_answer, write_question
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, buffer_server
+from tfbus.links.zenoh._lookup_session import Failures
+from tfbus.links.zenoh._settings import settings
 
 pytestmark = pytest.mark.anyio
 

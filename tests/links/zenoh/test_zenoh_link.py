@@ -19,12 +19,6 @@ import pytest
 import zenoh
 from support.processes import PATIENCE, free_ports, new_domain, until
 from support.samples import moving, static
-from tfbus.links._carrier import SendReport
-from tfbus.links._entries import MovingFrame, OutgoingBatch
-from tfbus.links._message import MessageWriter, write_answer
-from tfbus.links._state import LinkState, StateStep
-from tfbus.links.zenoh._keys import Keys
-from tfbus.links.zenoh._settings import settings
 
 from tfbus import (
     Buffer,
@@ -37,7 +31,13 @@ from tfbus import (
     TransformBroadcaster,
     TransformStamped,
 )
+from tfbus.links._carrier import SendReport
+from tfbus.links._entries import MovingFrame, OutgoingBatch
+from tfbus.links._message import MessageWriter, write_answer
+from tfbus.links._state import LinkState, StateStep
 from tfbus.links.zenoh import ZenohLink
+from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._settings import settings
 
 pytestmark = pytest.mark.anyio
 
