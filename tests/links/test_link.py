@@ -1,4 +1,3 @@
-import asyncio
 import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +12,7 @@ from support.foreign_world import ForeignCarrier, ForeignMessage, ForeignTransfo
 from support.processes import until
 from support.samples import moving, static
 
-from tfbus import Bus, BusClosedError, PeerJoined, PeerLost, PeerRejected, SimulatedClock
+from tfbus import Bus, PeerJoined, PeerLost, PeerRejected, SimulatedClock
 from tfbus.links import Link
 from tfbus.links.carrier import Presence, Received, ReceivedMessage, SendReport
 from tfbus.links.endpoint import ForeignEnd
@@ -120,68 +119,6 @@ async def test_a_link_between_a_bus_and_a_foreign_world_works_both_ways() -> Non
     assert link.id == "tfbus"
 
 
-async def test_samples_of_one_turn_go_out_together_and_a_full_turn_at_once() -> None:
-    carrier = LoggedCarrier()
-    with Bus() as bus:
-        async with link_of(bus, carrier):
-            for stamp in range(10):
-                bus.publish([moving("map", "a", stamp), moving("map", "b", stamp)])
-            assert carrier.calls == ["open"]
-            await until(lambda: "send 20" in carrier.calls)
-            carrier.calls.clear()
-            bus.publish([moving("map", "a", stamp) for stamp in range(4_999)])
-            assert carrier.calls == []
-            bus.publish(moving("map", "a", 4_999))
-            assert carrier.calls == ["send 5000"]
-            bus.publish(moving("map", "a", 5_000))
-        assert carrier.calls == ["send 5000", "send 1", "close"]
-
-
-async def test_a_link_tells_its_name_and_how_many_peers_it_has() -> None:
-    carrier, told = LoggedCarrier(), list[str]()
-    with Bus() as bus:
-        link = link_of(bus, carrier)
-        assert link.statistics().queue.capacity == 10_000
-        told.append(repr(link))
-        async with link:
-            for count, name in enumerate(("a", "b")):
-                told.append(repr(link))
-                carrier.receive(Received(name, Presence.JOINED))
-                await until(lambda count=count: len(link.peers) == count + 1)  # type: ignore[misc]
-            told.append(repr(link))
-    told.append(repr(link))
-    assert told == [
-        f"<Link 'world': {state}>" for state in ("not joined", "0 peers", "1 peer", "2 peers", "not joined")
-    ]
-
-
-@pytest.mark.every_loop
-async def test_a_link_is_entered_once() -> None:
-    with Bus() as bus:
-        link = link_of(bus, LoggedCarrier())
-        async with link:
-            with pytest.raises(RuntimeError, match="entered once"):
-                await link.__aenter__()
-        with pytest.raises(RuntimeError, match="entered once"):
-            await link.__aenter__()
-
-
-async def test_a_closed_bus_and_the_bus_of_another_thread_cannot_be_linked() -> None:
-    closed, carrier = Bus(), LoggedCarrier()
-    closed.close()
-    with pytest.raises(BusClosedError):
-        await link_of(closed, carrier).__aenter__()
-
-    async def enter(bus: Bus) -> None:
-        with pytest.raises(RuntimeError, match="thread"):
-            await link_of(bus, carrier).__aenter__()
-
-    with Bus() as bus, bus.threadsafe():
-        # This event loop has a claim on the bus now.
-        await anyio.to_thread.run_sync(asyncio.run, enter(bus))
-    assert carrier.calls == []
-
-
 async def test_arguments_that_make_no_sense_are_refused() -> None:
     with pytest.raises(TypeError, match="'base'"):
         link_of(Bus(), LoggedCarrier(), frames="base")
@@ -189,28 +126,6 @@ async def test_arguments_that_make_no_sense_are_refused() -> None:
         link_of(Bus(), LoggedCarrier(), capacity=0)
     with pytest.raises(ValueError, match="max_frames"):
         link_of(Bus(), LoggedCarrier(), max_frames=0)
-
-
-async def test_a_carrier_that_cannot_open_is_closed_and_the_bus_is_as_before() -> None:
-    carrier = LoggedCarrier(fails="open")
-    with Bus() as bus:
-        with pytest.raises(MineError):
-            await link_of(bus, carrier).__aenter__()
-        assert carrier.calls == ["open", "close"]
-        bus.publish(moving("map", "a", 1))
-        async with link_of(bus, LoggedCarrier()):
-            pass
-
-
-@pytest.mark.every_loop
-async def test_a_link_that_is_cancelled_while_it_opens_closes_its_carrier() -> None:
-    carrier = LoggedCarrier()
-    with Bus() as bus, anyio.CancelScope() as scope:
-        scope.cancel()
-        async with link_of(bus, carrier):
-            pass
-    assert scope.cancelled_caught
-    assert carrier.calls == ["open", "close"]
 
 
 async def test_what_comes_while_the_carrier_opens_is_published_when_the_link_has_joined() -> None:
@@ -221,15 +136,6 @@ async def test_what_comes_while_the_carrier_opens_is_published_when_the_link_has
         async with link_of(bus, carrier) as link:
             await receive_samples(link, 1)
             assert bus.statistics().frames == 1
-
-
-async def test_a_bus_that_closes_while_the_carrier_opens_is_not_linked() -> None:
-    carrier = LoggedCarrier()
-    bus = Bus()
-    carrier.while_opening = bus.close
-    with pytest.raises(BusClosedError):
-        await link_of(bus, carrier).__aenter__()
-    assert carrier.calls == ["open", "close"]
 
 
 async def test_the_error_of_the_body_comes_out_as_it_is_and_the_last_turn_goes_out() -> None:
@@ -259,25 +165,6 @@ async def test_what_was_published_last_goes_out_while_the_carrier_still_runs() -
             await until(lambda: "run" in carrier.calls)
             bus.publish(moving("map", "a", 1))
     assert carrier.calls == ["open", "run", "send 1", "end", "close"]
-
-
-async def test_an_error_of_the_running_carrier_ends_the_body_and_comes_out_as_it_is() -> None:
-    carrier = LoggedCarrier(fails="run")
-    with Bus() as bus, pytest.raises(MineError):
-        async with link_of(bus, carrier):
-            await anyio.sleep_forever()
-    assert carrier.calls[-1] == "close"
-
-
-@pytest.mark.every_loop
-async def test_a_cancelled_body_closes_the_carrier() -> None:
-    carrier = LoggedCarrier()
-    with Bus() as bus, anyio.CancelScope() as scope:
-        async with link_of(bus, carrier):
-            scope.cancel()
-            await anyio.sleep_forever()
-    assert scope.cancelled_caught
-    assert carrier.calls[-1] == "close"
 
 
 async def test_threads_may_bring_messages_in_any_number_and_the_loop_has_time_for_others() -> None:
@@ -348,16 +235,6 @@ async def test_the_rest_of_a_split_message_is_dropped_when_the_clock_jumps_back(
             assert link.statistics().received_samples < 50
 
 
-async def test_messages_beyond_the_capacity_are_dropped_and_counted() -> None:
-    carrier = LoggedCarrier()
-    with Bus() as bus:
-        async with link_of(bus, carrier, capacity=10) as link:
-            for stamp in range(25):
-                carrier.receive(Received("driver", ForeignMessage(False, [ARM._replace(stamp=stamp)]), moving=True))
-            assert (link.statistics().queue.pending, link.statistics().queue.dropped) == (10, 15)
-            await receive_samples(link, 10)
-
-
 async def test_moving_items_that_wait_when_the_clock_jumps_back_are_dropped() -> None:
     clock, carrier = SimulatedClock(start=10), LoggedCarrier()
     with Bus(clock) as bus:
@@ -413,16 +290,6 @@ async def test_presence_and_refusals_are_announced_under_the_name_of_the_link() 
     assert (lost.authorities, lost.frames) == (("foreign",), ("arm",))
 
 
-async def test_the_frames_of_a_lost_peer_stay_unless_they_are_to_be_dropped() -> None:
-    carrier = LoggedCarrier()
-    with Bus() as bus:
-        async with link_of(bus, carrier) as link:
-            for content in (Presence.JOINED, ForeignMessage(False, [ARM]), Presence.LEFT):
-                carrier.receive(Received("driver", content))
-            await until(lambda: link.statistics().queue.pending == 0)
-            assert (link.peers, bus.statistics().frames) == ((), 1)
-
-
 async def test_only_wanted_frames_go_out_and_come_in() -> None:
     world = ForeignWorld()
     with Bus() as bus:
@@ -433,27 +300,6 @@ async def test_only_wanted_frames_go_out_and_come_in() -> None:
             await until(lambda: link.statistics().sent_samples == 1)
         assert bus.statistics().samples == 3
     assert world.published[-1] == ("tfbus", ForeignMessage(False, [ForeignTransform("map", "base", 1, 0.0)]))
-
-
-def test_items_received_after_a_crash_of_the_event_loop_do_no_harm() -> None:
-    carrier = LoggedCarrier()
-    message = Received("driver", ForeignMessage(False, [ARM]), moving=True)
-
-    async def crash(bus: Bus) -> Link:
-        link = link_of(bus, carrier)
-        await link.__aenter__()
-        return link
-
-    with Bus() as bus:
-        loop = asyncio.new_event_loop()
-        link = loop.run_until_complete(crash(bus))
-        for task in asyncio.all_tasks(loop):
-            task.cancel()
-        loop.run_until_complete(asyncio.sleep(0))
-        loop.close()
-        for _ in range(3):
-            carrier.receive(message)
-        assert link.statistics().queue.pending == 3
 
 
 async def test_what_is_not_sent_is_counted_each_time_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -467,28 +313,6 @@ async def test_what_is_not_sent_is_counted_each_time_and_logged_once(caplog: pyt
         async with link_of(bus, RefusingCarrier()) as link:
             assert link.statistics().not_sent == {"frame name": 2}
     assert caplog.messages == ["not sent over the link world: the name is too long"]
-
-
-async def test_a_link_tells_no_time_that_it_is_not_to_tell() -> None:
-    clock, carrier = SimulatedClock(), LoggedCarrier()
-    told: list[int | None] = []
-    carrier.send = lambda turn: told.append(turn.time)  # type: ignore[method-assign]
-    with Bus(clock) as bus:
-        async with link_of(bus, carrier):
-            clock.set(1_000)
-            bus.publish(moving("map", "a", 1))
-            await until(lambda: bool(told))
-    assert told == [None]
-
-
-async def test_a_link_tells_the_time_that_it_finds_although_the_clock_stands_still() -> None:
-    clock, carrier = SimulatedClock(start=7), LoggedCarrier()
-    told: list[int | None] = []
-    carrier.send = lambda turn: told.append(turn.time)  # type: ignore[method-assign]
-    with Bus(clock) as bus:
-        async with link_of(bus, carrier, tell_clock=True):
-            await anyio.wait_all_tasks_blocked()
-            assert told == [7]
 
 
 async def test_a_link_drives_a_clock_that_follows_and_tells_the_time_of_its_own() -> None:

@@ -171,12 +171,12 @@ class Wire:
     def meet(self, other: "Wire") -> None:
         if other.id not in self.met and (other, self) not in self.network.cuts and self.channel_of(other) is not None:
             self.met.add(other.id)
-            self._arrive(other.id, Joined(other.robot))
+            self.bring(other.id, Joined(other.robot))
 
     def part(self, other: "Wire") -> None:
         if other.id in self.met:
             self.met.remove(other.id)
-            self._arrive(other.id, Left())
+            self.bring(other.id, Left())
 
     def is_heard(self, channel: str) -> bool:
         return any(other.channel_of(self) == channel for other in self.network.wires if other is not self)
@@ -196,10 +196,10 @@ class Wire:
             return False
         self.network.carried.append((kind_of(message), len(message)))
         if world.random.random() >= self.network.loss:
-            other._arrive(self.id, message, world.random.uniform(0.0001, 0.005))
+            other.bring(self.id, message, world.random.uniform(0.0001, 0.005))
         return True
 
-    def _arrive(self, sender: str, item: WireItem, delay: float = 0.0) -> None:
+    def bring(self, sender: str, item: WireItem, delay: float = 0.0) -> None:
         def take() -> None:
             if self in self.network.wires:
                 self._receive(sender, item)
