@@ -73,7 +73,7 @@ def read(data: bytes) -> Heard:
 
 
 def facts(entries: Sequence[Any]) -> list[Any]:
-    """What entries say, to be compared."""
+    """The facts of entries, to be compared."""
     return [
         entry
         if isinstance(entry, RemovedFrame)
@@ -83,7 +83,7 @@ def facts(entries: Sequence[Any]) -> list[Any]:
 
 
 def reason_of(data: bytes) -> str:
-    """Why a message is refused, before any part of it."""
+    """The reason for which a message is refused, before any part of it."""
     parts: Iterator[object] = read_message(data)
     with pytest.raises(MalformedMessageError) as refused:
         for part in parts:

@@ -32,7 +32,7 @@ NAMES = "abcdef"
 
 
 def said(frame: str, number: int) -> TransformStamped | None:
-    """What is said of a frame with a number: a removal, a static or a moving sample."""
+    """An entry of a frame with a number: a removal, a static or a moving sample."""
     return (None, static("map", frame, stamp=number), moving("map", frame, number))[number % 3]
 
 
@@ -109,7 +109,7 @@ class Copies(RuleBasedStateMachine):
 
     @rule(frames=st.none() | st.sets(st.sampled_from(NAMES)))
     def settle(self, frames: set[str] | None) -> None:
-        """When all has settled, digests are equal if the entries are, removals among them, and only then."""
+        """Once all has settled, digests are equal if the entries are, removals among them, and only then."""
         for _ in range(2):
             claims = [copy.claim(self.now, frames) for copy in self.copies]
             self.now += SETTLING

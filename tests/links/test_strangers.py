@@ -48,7 +48,7 @@ class Scene:
         self.stranger.say(RemovedFrame(origin, self.first + number, frame))
 
     def told(self) -> list[Any]:
-        """What the link has published since this was asked last."""
+        """The messages that the link has published since this was asked last."""
         found: list[Any] = []
         for message in self.stranger.heard(Kind.LIVE):
             for part in read_message(message):

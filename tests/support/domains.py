@@ -139,7 +139,7 @@ class Network:
                 other.part(wire)
 
     def sent(self, *kinds: Kind) -> int:
-        """How many messages of some kinds were sent since this was called last, each receiver's counted."""
+        """The number of messages of some kinds sent since this was called last, each receiver's counted."""
         found = sum(kind in kinds for kind, _ in self.carried)
         self.carried.clear()
         return found
@@ -253,7 +253,7 @@ class Stranger(Wire):
 
 
 class Host:
-    """What an end needs of its link and of an event loop."""
+    """The part of a link and of an event loop that an end needs."""
 
     def __init__(self, process: "Process", end: Endpoint) -> None:
         self._process = process

@@ -16,7 +16,7 @@ class MemoryNetwork:
         self.wires: dict[str, MemoryWire] = {}
         self.cut: set[tuple[str, str]] = set()
         self.stopped: dict[str, list[Callable[[], object]]] = {}
-        self.lose: Callable[[str, str, bytes], bool] = lambda sender, link, message: False
+        self.lose: Callable[[str, str, bytes], bool] = lambda *_: False
 
     def wire(self, robot: str = "") -> "MemoryWire":
         return MemoryWire(self, robot)
@@ -75,7 +75,12 @@ class MemoryWire:
         self.met: set[str] = set()
         self._hears: Sequence[Hearing] = ()
 
-    async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
+    async def open(
+        self,
+        hears: Sequence[Hearing],
+        receive: Receive,
+        warn: Callable[[Exception], object],  # noqa: ARG002 - a network in memory has nothing to warn of
+    ) -> None:
         self._hears, self.receive = hears, receive
         self._network.wires[self.id] = self
         for other in list(self._network.wires.values()):
@@ -94,10 +99,10 @@ class MemoryWire:
         return next((hearing.channel for hearing in self._hears if fnmatchcase(robot, hearing.robots)), None)
 
     def meet(self, other: "MemoryWire") -> None:
-        if self.channel_of(other.robot) is not None and other.id not in self.met:
-            if (other.id, self.id) not in self._network.cut:
-                self.met.add(other.id)
-                self.receive(other.id, Joined(other.robot))
+        is_new = self.channel_of(other.robot) is not None and other.id not in self.met
+        if is_new and (other.id, self.id) not in self._network.cut:
+            self.met.add(other.id)
+            self.receive(other.id, Joined(other.robot))
 
     def part(self, other: str) -> None:
         if other in self.met:

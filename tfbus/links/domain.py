@@ -171,7 +171,7 @@ class DomainEnd(Endpoint):
         self.lookups = RemoteLookups(wire.send, wire.id, name)
         self._news: dict[str, bool] = {}
         self._thinned: dict[str, float] = {}
-        # What is answered takes half of the time of the event loop at most.
+        # Answers take half of the time of the event loop at most.
         self._questions: dict[tuple[str, Kind], bytes] = {}
         self._answers_due = -inf
         self._waiting: dict[str, Joined] = {}
@@ -408,7 +408,7 @@ class DomainEnd(Endpoint):
                 size = len(entry.samples)
                 if not self._admit_number(peer, entry.sequence, size):
                     continue
-                # What an answer tells of buses that the peer does not lead to is not the peer's.
+                # An answer may tell of buses that the peer does not lead to; they are not the peer's.
                 others = entry.origin not in peer.paths
                 if not others and not self.peers.admit_authorities(peer, entry.authorities, size):
                     continue
@@ -677,7 +677,7 @@ class DomainEnd(Endpoint):
         replica = self._replicas.get(gone)
         if replica is None or len(self._replicas) <= MOST_ROBOTS:
             return
-        # Those that have come or gone last are the last.
+        # Buses that have come or gone last are the last.
         self._replicas[gone] = self._replicas.pop(gone)
         here = {peer.robot for peer in self.peers} | {self._robot}
         absent = [robot for robot in self._replicas if robot not in here]
