@@ -132,7 +132,7 @@ def test_a_directory_that_others_can_enter_is_a_usage_error_that_says_what_to_do
     [
         (LinkOptions(), "hears 1 peer on this machine"),
         (LinkOptions(robots=("r1",)), "hears nobody on this machine"),
-        (LinkOptions(listen=(NOBODY,)), f"hears nobody by the router of this program at {NOBODY}"),
+        (LinkOptions(listen=("tcp/127.0.0.1:0",)), "hears nobody by the router of this program at tcp/127.0.0.1:0"),
         (LinkOptions(connect=(NOBODY, "tcp/a:1")), f"hears nobody by a router at {NOBODY} or tcp/a:1"),
     ],
 )
