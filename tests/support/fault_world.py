@@ -160,6 +160,7 @@ class World:
         time.sleep(self.rng.choice((0.0, 0.1, 0.5, 2.0, 5.0, 12.0)[: self.longest_pauses]))
 
     longest_pauses = 6
+    """So many of the pauses of `live` are drawn from, the shortest first."""
 
     def mend(self) -> None:
         for member in self.members:
