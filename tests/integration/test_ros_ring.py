@@ -90,7 +90,7 @@ async def test_a_ring_of_local_links_dds_and_a_router_hears_each_sample_once_and
         authorities: list[set[tuple[str, str]]] = [set() for _ in buses]
         for bus, counter, named in zip(buses, heard, authorities, strict=True):
             bus.subscribe(_counting(counter))
-            bus.subscribe(lambda batch, named=named: named.update((each.child, each.authority) for each in batch))
+            bus.subscribe(_naming(named))
         links: list[Any] = [
             await stack.enter_async_context(link)
             for link in (
@@ -129,3 +129,10 @@ def _counting(counter: Counter[tuple[str, int]]) -> Callable[[Any], None]:
         counter.update((sample.child, sample.stamp) for sample in batch if not sample.static)
 
     return count
+
+
+def _naming(named: set[tuple[str, str]]) -> Callable[[Any], None]:
+    def name(batch: Any) -> None:
+        named.update((sample.child, sample.authority) for sample in batch)
+
+    return name

@@ -124,15 +124,10 @@ class World:
     def publish(self, member: Member, *frames: str) -> None:
         for frame in frames:
             static, x = not frame.endswith("moves"), float(next(self._numbers))
-            sample = {
-                "parent": "map",
-                "child": frame,
-                "stamp": 0 if static else time.time_ns(),
-                "x": x,
-                "static": static,
-            }
-            self._said[frame, (static, int(sample["stamp"]), x)] = member.ids[0]
+            stamp = 0 if static else time.time_ns()
+            self._said[frame, (static, stamp, x)] = member.ids[0]
             self._recent.add(frame)
+            sample = {"parent": "map", "child": frame, "stamp": stamp, "x": x, "static": static}
             member.process.ask("publish", samples=[sample])
 
     def remove(self, member: Member, frame: str) -> None:
