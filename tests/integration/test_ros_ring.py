@@ -1,6 +1,6 @@
-"""Three buses in a ring: a rosbridge joins the first two, DDS the second two, and a domain the last to the first.
+"""Three buses in a ring: one network joins the first two, another the second two, a third the last to the first.
 
-`tests/stress/test_foreign_storms.py` has the same ring, and others, without a network.
+`tests/stress/test_foreign_storms.py` has such rings in simulated time.
 """
 
 from collections import Counter
@@ -19,7 +19,7 @@ from support.processes import free_address, new_domain, until
 from support.rosbridge import rosbridge_server
 from support.samples import latched, moving, static
 
-from tfbus import Bus
+from tfbus import Bus, LocalLink
 from tfbus.links.dds import DdsLink
 from tfbus.links.rosbridge import RosbridgeLink
 from tfbus.links.zenoh import ZenohLink
@@ -79,8 +79,60 @@ async def test_a_ring_of_rosbridge_dds_and_zenoh_hears_each_sample_once(domain_n
         assert [link.statistics().rejected for link in links] == [{}] * len(links)
 
 
+async def test_a_ring_of_local_links_dds_and_a_router_hears_each_sample_once_and_keeps_its_authority(
+    domain_number: int,
+) -> None:
+    address, domain = free_address(), new_domain()
+    async with AsyncExitStack() as stack:
+        buses = [stack.enter_context(Bus()) for _ in range(3)]
+        first, second, third = buses
+        heard: list[Counter[tuple[str, int]]] = [Counter() for _ in buses]
+        authorities: list[set[tuple[str, str]]] = [set() for _ in buses]
+        for bus, counter, named in zip(buses, heard, authorities, strict=True):
+            bus.subscribe(_counting(counter))
+            bus.subscribe(_naming(named))
+        links: list[Any] = [
+            await stack.enter_async_context(link)
+            for link in (
+                LocalLink(first, domain),
+                LocalLink(second, domain),
+                DdsLink(second, domain_number),
+                DdsLink(third, domain_number),
+                ZenohLink(third, domain, listen=address),
+                ZenohLink(first, domain, connect=address),
+            )
+        ]
+        await until(lambda: all(len(link.peers) == 1 for link in links))
+        for stamp in range(STAMPS):
+            for bus, child in zip(buses, ("first", "second", "third"), strict=True):
+                bus.publish(moving("map", child, stamp, authority=f"node of {child}"))
+            await anyio.sleep(0.005)
+        second.publish(static("map", "lidar", 1.0, authority="node of second"))
+        await until(lambda: all("lidar" in latched(bus) for bus in buses))
+        everything = Counter({(child, stamp): 1 for child in ("first", "second", "third") for stamp in range(STAMPS)})
+        await until(lambda: all(counter.total() >= everything.total() for counter in heard))
+        # What still goes round arrives before a sign of life of each link.
+        await anyio.sleep(2.5)
+        assert heard == [everything] * 3
+        # DDS tells its writer instead, and may be the faster way.
+        true = {(child, f"node of {child}") for child in ("first", "second", "third")}
+        assert true | {("lidar", "node of second")} <= authorities[0]
+        assert [link.statistics().rejected for link in links] == [{}] * len(links)
+        sent = [link.statistics().sent_samples for link in links]
+        await anyio.sleep(1.0)
+        assert [link.statistics().sent_samples for link in links] == sent
+        assert max(sent) <= everything.total() + 3
+
+
 def _counting(counter: Counter[tuple[str, int]]) -> Callable[[Any], None]:
     def count(batch: Any) -> None:
         counter.update((sample.child, sample.stamp) for sample in batch if not sample.static)
 
     return count
+
+
+def _naming(named: set[tuple[str, str]]) -> Callable[[Any], None]:
+    def name(batch: Any) -> None:
+        named.update((sample.child, sample.authority) for sample in batch)
+
+    return name

@@ -40,7 +40,7 @@ def tell(capsys: pytest.CaptureFixture[str], line: str) -> None:
 def test_a_few_faults_on_one_machine_leave_all_buses_equal(processes: Crowd, directory: Path, drop_lost: bool) -> None:
     world = OneMachine(processes, 0, drop_lost, directory)
     world.longest_pauses = 2
-    world.run(rounds=4)
+    world.run(rounds=3)
 
 
 @pytest.mark.thorough

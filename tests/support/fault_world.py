@@ -124,15 +124,10 @@ class World:
     def publish(self, member: Member, *frames: str) -> None:
         for frame in frames:
             static, x = not frame.endswith("moves"), float(next(self._numbers))
-            sample = {
-                "parent": "map",
-                "child": frame,
-                "stamp": 0 if static else time.time_ns(),
-                "x": x,
-                "static": static,
-            }
-            self._said[frame, (static, int(sample["stamp"]), x)] = member.ids[0]
+            stamp = 0 if static else time.time_ns()
+            self._said[frame, (static, stamp, x)] = member.ids[0]
             self._recent.add(frame)
+            sample = {"parent": "map", "child": frame, "stamp": stamp, "x": x, "static": static}
             member.process.ask("publish", samples=[sample])
 
     def remove(self, member: Member, frame: str) -> None:
@@ -160,6 +155,7 @@ class World:
         time.sleep(self.rng.choice((0.0, 0.1, 0.5, 2.0, 5.0, 12.0)[: self.longest_pauses]))
 
     longest_pauses = 6
+    """So many of the pauses of `live` are drawn from, the shortest first."""
 
     def mend(self) -> None:
         for member in self.members:

@@ -164,7 +164,8 @@ class Relay:
         ------
         BusClosedError
         """
-        if foreign and self._passed is None:
+        if (foreign or self._outboxes) and self._passed is None:
+            # A bus with two links may hear a sample that has gone through a world without origins by either.
             self._passed = PassedSamples()
         if not self._outboxes:
             self._registration = self._bus.subscribe(self._on_batch, self._on_removal)
