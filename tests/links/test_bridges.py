@@ -133,7 +133,7 @@ def lidar(x: float) -> ForeignTransform:
 
 
 def transforms(*places: ForeignWorld) -> Counter[tuple[bool, str, int]]:
-    """How often each transform was published."""
+    """The number of times that each transform was published."""
     published = [message for place in places for _, message in place.published]
     return Counter((message.static, each.child, each.stamp) for message in published for each in message.transforms)
 

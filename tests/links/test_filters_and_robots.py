@@ -15,7 +15,7 @@ from tfbus.links.relay import ReceivedBatch
 
 
 def counts(process: Process) -> dict[str, int]:
-    """How many samples of each frame a bus has heard."""
+    """The number of samples of each frame that a bus has heard."""
     found: dict[str, int] = {}
     for sample in process.seen:
         found[sample.child] = found.get(sample.child, 0) + 1

@@ -88,7 +88,7 @@ class LoopWaker:
     def _call(self) -> None:
         self._requested = False
         try:
-            # That of a task: a thread's own does not tell anyio which loop runs, so no task could be started.
+            # The context of a task: a thread's own does not tell anyio which loop runs, so no task could be started.
             self._context.run(self._callback)
         except Exception:
             # No task would hear of it, and it would end the whole run of trio.

@@ -1,9 +1,9 @@
 """The command line: the subcommands, the options of all of them, and the exit status for whatever happens.
 
-`run` parses the words with cyclopts, which loads the module of the one subcommand that they name. The help of all is
-printed without cyclopts, which takes several times as long to load. A subcommand returns its exit status, or None for
-success. It raises `UsageError`, a `RecordingError` or a `TransformLookupError` for what a user can cause, and `run`
-prints a line for each.
+`run` parses the words with cyclopts, which loads the module of the one subcommand that they name. The help of all and
+the version are printed without cyclopts, which takes several times as long to load. A subcommand returns its exit
+status, or None for success. It raises `UsageError`, a `RecordingError` or a `TransformLookupError` for what a user can
+cause, and `run` prints a line for each.
 """
 
 import os
@@ -82,11 +82,11 @@ def run(words: Sequence[str], loaded: Callable[[], object] = lambda: None) -> in
     # `info` is a level of the log, too.
     named = (word for before, word in zip(("", *words), words, strict=False) if before != "--log-level")
     command = next((word for word in named if word in COMMANDS), None)
-    app = None if list(words) in ([], ["-h"], ["--help"]) else application(command)
+    app = None if tuple(words) in _PAGES else application(command)
     status = 0
     try:
         if app is None:
-            print(_overview(), flush=True)
+            print(_PAGES[tuple(words)](), flush=True)
             return status
         prepare, arguments, _ = app.meta.parse_args(words, exit_on_error=False, print_error=False)
         program = prepare(*arguments.args, **arguments.kwargs)
@@ -207,6 +207,10 @@ def _version() -> str:
     from tfbus.which_kernel import kernel
 
     return f"{version('tfbus')} ({kernel} kernel)"
+
+
+_PAGES: Final = dict.fromkeys([(), ("-h",), ("--help",)], _overview) | {("--version",): _version}
+"""The pages that need no cyclopts, by the words that ask for them."""
 
 
 def _run_logging(level: _LogLevel, program: _Program) -> int | None:
