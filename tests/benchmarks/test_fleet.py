@@ -19,7 +19,8 @@ from support.processes import free_address, new_domain, until
 from support.samples import moving, static
 
 from tfbus import Buffer, Bus
-from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink
+from tfbus.links import BufferServer
+from tfbus.links.zenoh import ZenohLink
 
 pytest_plugins = ["side_by_side"]
 
@@ -45,7 +46,7 @@ async def main(domain, address, bare):
         bus.publish([static("base", "lidar", x=2.0), moving("map", "base", 5, x=1.0), moving("map", "base", 9, x=5.0)])
         answer = lambda query: query.reply(query.key_expr, bytes(400), express=True)
         queryable = zenoh_session.declare_queryable("bare", zenoh.handlers.Callback(answer, indirect=False))
-        async with BufferServer(buffer, domain, listen=address):
+        async with ZenohLink(bus, domain, listen=address) as link, BufferServer(buffer, link):
             print("ready", flush=True)
             await anyio.to_thread.run_sync(sys.stdin.read)
 """
@@ -53,7 +54,8 @@ async def main(domain, address, bare):
 # A process that asks for a stamp, from its input, many times at once.
 ASKER = """
 async def main(domain, address, count):
-    async with BufferClient(domain, connect=address) as client, anyio.create_task_group() as tasks:
+    asker = ZenohLink(Bus(), domain, connect=address, robots={"*": 0.0})
+    async with asker as client, anyio.create_task_group() as tasks:
         await client.lookup("map", "base", 0)
         print("ready", flush=True)
         stamp = int(await anyio.to_thread.run_sync(sys.stdin.readline))
@@ -77,7 +79,7 @@ async def main(domain, address, robots, frames, rate):
     async with AsyncExitStack() as stack:
         buses = [stack.enter_context(Bus()) for _ in range(robots)]
         for number, bus in enumerate(buses):
-            link = ZenohLink(bus, domain, robot=f"r{number}", robots=[], connect=address, config={"mode": "client"})
+            link = ZenohLink(bus, domain, robot=f"r{number}", robots=[], connect=address)
             await stack.enter_async_context(link)
         print("ready", flush=True)
         async for _ in buses[0].clock.ticks(rate):
@@ -92,7 +94,8 @@ import zenoh
 from support.samples import moving, static
 from test_fleet import session
 from tfbus import Buffer, Bus
-from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, ZenohRouter
+from tfbus.links import BufferServer
+from tfbus.links.zenoh import ZenohLink, ZenohRouter
 """
 
 
@@ -156,7 +159,7 @@ def test_remote_lookup(table: Table) -> None:
     bare: list[float] = []
 
     async def main() -> None:
-        async with BufferClient(domain, connect=address) as client:
+        async with ZenohLink(Bus(), domain, connect=address, robots={"*": 0.0}) as client:
             await client.lookup("map", "lidar", timeout=10)
             for _ in range(ASKED):
                 began = time.perf_counter()
@@ -184,7 +187,7 @@ def test_one_robot_of_many(table: Table) -> None:
 
         async def look(heard: list[str]) -> list[float]:
             with Bus() as bus:
-                async with ZenohLink(bus, domain, robots=heard, connect=address, config={"mode": "client"}):
+                async with ZenohLink(bus, domain, robots=heard, connect=address):
                     await anyio.sleep(2.0)
                     before = [time.process_time(), float(router("", True))]
                     await anyio.sleep(SECONDS)
@@ -226,7 +229,7 @@ def test_remote_waits(table: Table) -> None:
     async def main() -> None:
         with Bus() as bus, Buffer(bus, keep=None) as buffer:
             bus.publish(moving("map", "base", 0))
-            async with BufferServer(buffer, domain, listen=address) as server:
+            async with ZenohLink(bus, domain, listen=address) as link, BufferServer(buffer, link) as server:
 
                 def answered() -> int:
                     return server.statistics().answered
