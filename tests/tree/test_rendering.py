@@ -13,7 +13,6 @@ from xml.etree import ElementTree as ET
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from IPython.core.formatters import HTMLFormatter
 from support.samples import moving, static, tree_of
 from support.strategies import TODAY, frame_names
 
@@ -305,7 +304,8 @@ def test_the_legend_names_every_state_in_its_colour() -> None:
 
 def in_a_notebook(value: object) -> str:
     """The page that a notebook shows for a value."""
-    html: str = HTMLFormatter()(value)
+    formatters = pytest.importorskip("IPython.core.formatters", reason="a notebook needs IPython")
+    html: str = formatters.HTMLFormatter()(value)
     return html
 
 

@@ -106,7 +106,7 @@ def test_lost_samples_are_warned_of(tmp_path: Path, tfbus: Command) -> None:
         await anyio.wait_all_tasks_blocked()
 
     done = tfbus.on_domain(publish_too_many, "record", tmp_path / "run.mcap", clock=SystemClock())
-    assert done.stderr.splitlines()[-1] == "tfbus: the disk is too slow: samples are lost, 1000 so far"
+    assert "tfbus: the disk is too slow: samples are lost, 1000 so far" in done.stderr.splitlines()
 
 
 def test_an_existing_file_is_kept_unless_it_may_be_overwritten(tmp_path: Path, tfbus: Command) -> None:
