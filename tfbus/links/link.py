@@ -289,7 +289,7 @@ class DomainLink(Link):
         How often this link sends the newest sample of each moving frame to those that asked for less than all, in Hz.
     frames : iterable of str, optional
         Send and take only these children; by default all. Peers send this link no others, while the names take less
-        than 64 kB and a peer has at most a hundred different filters to serve.
+        than 64 kB and a peer has at most a hundred different filters to serve; beyond that they send all.
     drop_lost : bool
         Whether the frames of a bus leave this one while no way leads to it any more, because its process has ended or
         was cut off. Otherwise they stay until somebody removes them, here and at whoever joins later.
