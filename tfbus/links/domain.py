@@ -208,7 +208,9 @@ class DomainEnd(Endpoint):
             self.handle(sender, _Due(kind, self._questions.pop((sender, kind))))
             after = self._now()
             now, self._answers_due = after, 2 * after - now
-        question = self._agreement.question(now)
+        is_due = now >= self._agreement.next_due()
+        is_behind = is_due and (self.host.is_behind() or self._wire.is_behind())
+        question = self._agreement.question(now, is_behind) if is_due else None
         if question is not None:
             frames = sorted(self.frames) if self.frames is not None and self._filters else None
             text = write_text(Kind.QUESTION, {"since": question.since, "frames": frames})

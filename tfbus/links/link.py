@@ -203,6 +203,10 @@ class Link:
         else:
             self._turn_ends.wake()
 
+    def is_behind(self) -> bool:
+        """Whether items wait to be handled. Called by the end."""
+        return self._whole is not None or len(self._receive_queue) > 0
+
     def stir(self) -> None:
         """Look again what is due. Called by the end."""
         if self._stirred is not None:

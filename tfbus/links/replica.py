@@ -32,9 +32,11 @@ entries, so a frame that moves many times a second does not make copies differ.
    A copy of some frames only is compared over these, once its link has asked for them.
 2. Where digests differ, and the other sequence is beyond what is known of that copy, the link asks it a little later,
    if they differ still. A missing number among the live messages is a reason to ask it soon, whatever the digests.
-3. There is one question at a time. Answers are bounded, and the next one is asked for behind the last, up to the
+3. A link that has not read all that has come puts its questions off, for what is missing may be there already; else
+   those that are busy would make each other busier.
+4. There is one question at a time. Answers are bounded, and the next one is asked for behind the last, up to the
    newest. Answers without news make the next question to that link wait twice as long.
-4. A link that starts asks the first one that it meets for all at once.
+5. A link that starts asks the first one that it meets for all at once.
 
 So all copies agree some seconds after any trouble, without one digest for each peer and without a leader.
 
@@ -77,6 +79,8 @@ MOST_REMEMBERED = 1_000
 """So many lost peers are remembered, with what was known of their copies."""
 PATIENCE = 3.0
 """s; so long a link waits for an answer."""
+LONGEST_DELAY = 10.0
+"""s; so long a link that has no time to read puts a question off."""
 _LONGEST_PAUSE = 60.0
 _ASK_AGAIN = 30.0
 _SPARE = 1_000
@@ -395,7 +399,20 @@ def _told(frame: str, entry: Entry) -> OutgoingBatch | RemovedFrame:
 class _Copy:
     """The copy of one peer, as far as it is known."""
 
-    __slots__ = ("again", "claim", "due", "frames", "fruitless", "missed", "must_ask", "replica", "seen", "silences")
+    __slots__ = (
+        "again",
+        "claim",
+        "due",
+        "frames",
+        "fruitless",
+        "latest",
+        "missed",
+        "must_ask",
+        "replica",
+        "seen",
+        "silences",
+        "urgent",
+    )
 
     def __init__(self, replica: Replica, seen: int, must_ask: bool) -> None:
         self.replica = replica
@@ -408,6 +425,9 @@ class _Copy:
         self.seen = seen
         self.claim: Claim | None = None
         self.due = inf
+        # Whether the question is not put off, and until when it is.
+        self.urgent = False
+        self.latest = inf
         self.missed = False
         # Answers without news, and questions without an answer, one after the other.
         self.fruitless = 0
@@ -440,7 +460,7 @@ class Agreement:
         self._copies[peer] = copy = _Copy(replica, seen if remembered is replica else 0, must_ask)
         if self._is_new or must_ask:
             self._is_new = False
-            copy.due, copy.missed = now, True
+            copy.due, copy.missed, copy.urgent = now, True, True
 
     def filters(self, peer: str, frames: Collection[str]) -> None:
         """The copy of a peer is of these frames only, which are among those of the own copy."""
@@ -476,7 +496,7 @@ class Agreement:
             copy.seen, copy.due, copy.fruitless = claim.sequence, inf, 0
         elif claim.sequence > copy.seen:
             pause = 0.0 if soon else min(uniform(0.3, 0.7) * 2**copy.fruitless, _LONGEST_PAUSE)
-            copy.due = min(copy.due, now + pause)
+            copy.due, copy.urgent = min(copy.due, now + pause), copy.urgent or soon
 
     def missed(self, peer: str, now: float) -> None:
         """Live messages of a peer did not come."""
@@ -496,10 +516,10 @@ class Agreement:
             self._fail(copy, now)
             return
         copy.seen = claim.sequence
-        copy.due = now
+        copy.due, copy.urgent = now, True
         copy.again = now + _ASK_AGAIN if copy.must_ask else inf
         if claim.final:
-            copy.due, copy.missed, copy.claim, copy.silences = inf, False, claim, 0
+            copy.due, copy.urgent, copy.missed, copy.claim, copy.silences = inf, False, False, claim, 0
             copy.fruitless = 0 if news or self._agrees(copy, now) else min(copy.fruitless + 1, 10)
 
     def unanswered(self, peer: str, now: float) -> None:
@@ -510,8 +530,15 @@ class Agreement:
             if copy is not None:
                 self._fail(copy, now)
 
-    def question(self, now: float) -> Question | None:
-        """The question to ask now; None if there is none, or an answer is awaited."""
+    def question(self, now: float, is_behind: bool = False) -> Question | None:
+        """The question to ask now; None if there is none, or an answer is awaited.
+
+        Parameters
+        ----------
+        now : float
+        is_behind : bool
+            Whether the link has not read all that has come.
+        """
         if self._asked is not None:
             if now < self._patience:
                 return None
@@ -521,8 +548,13 @@ class Agreement:
             if peer is None or self._due_of(peer) > now:
                 return None
             copy = self._copies[peer]
-            again, copy.due = copy.again <= now, inf
-            copy.again = inf
+            again = copy.again <= now
+            if is_behind and not (again or copy.urgent) and now < copy.latest:
+                copy.latest = min(copy.latest, now + LONGEST_DELAY)
+                copy.due = now + uniform(0.05, 0.1)
+                continue
+            copy.due = copy.again = copy.latest = inf
+            copy.urgent = False
             if again or copy.missed or not self._agrees(copy, now):
                 self._asked, self._patience = Question(peer, copy.seen), now + PATIENCE
                 return self._asked

@@ -138,6 +138,9 @@ class LocalWire(Wire):
     def is_heard(self, channel: str) -> bool:
         return bool(self._hearers.get(channel))
 
+    def is_behind(self) -> bool:
+        return any(readable for _, readable, _ in self._poll.ready())
+
     def publish(self, channel: str, message: bytes) -> None:
         hearers = self._hearers.get(channel)
         if hearers and len(message) <= MAX_MESSAGE:
