@@ -448,10 +448,17 @@ class DomainEnd(Endpoint):
                 assert peer is not None
                 self.peers.reject(peer.id, "too many frames", error)
                 continue
-            # Of a moving frame, every live sample counts; the relay knows which of them have come before.
-            if is_new or (live and not static and _moves(replica.entries[child])):
+            if is_new or (live and not static and self._may_be_news(replica.entries[child], provenance.origin)):
                 kept.append(sample)
         return kept
+
+    def _may_be_news(self, entry: Entry, origin: bytes) -> bool:
+        """Whether a live sample that moves a frame, and is not the newest of it, may be one that has not come before.
+
+        Every such sample counts. The relay knows which have come before, but for those of a lost bus, which it forgets.
+        """
+        moves = entry.sample is not None and not entry.sample.static
+        return moves and (entry.origin == origin or self.relay.reaches(origin))
 
     def _is_wanted(self, sample: ReceivedTransform) -> bool:
         return self.frames is None or sample._fields[1] in self.frames
@@ -700,7 +707,3 @@ class _Due(NamedTuple):
 
     kind: Kind
     data: bytes
-
-
-def _moves(entry: Entry) -> bool:
-    return entry.sample is not None and not entry.sample.static

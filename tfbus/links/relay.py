@@ -438,7 +438,10 @@ class Relay:
                 fields = sample._fields
                 if self._passed is not None:
                     self._passed.add(sample)
-                self._latest[fields[1]] = provenance
+                latest = self._latest.get(fields[1])
+                # A sample of another bus that is late does not make the frame its own.
+                if latest is None or latest.sequence < provenance.sequence or latest.rank < provenance.rank:
+                    self._latest[fields[1]] = provenance
                 if fields[5]:
                     self._settled[fields[1]] = provenance.rank
             outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
