@@ -316,10 +316,11 @@ class DomainEnd(Endpoint):
         if isinstance(content, Joined):
             peer = self._join(sender, content.robot)
             if peer is not None:
+                peer.rate = self._rate_of(peer.robot)
                 self._meet(peer)
                 self._sign_sooner()
                 # Nothing is wanted of a robot of rate 0 but answers to lookups.
-                if self._rate_of(peer.robot):
+                if peer.rate:
                     # A peer hears of a filter by the first question.
                     self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
                     if self._history is not None:
@@ -367,7 +368,7 @@ class DomainEnd(Endpoint):
             self._update_ways(peer, heard)
             if heard.kind in (Kind.SIGN, Kind.MEETING):
                 self.lookups.note_server(sender, peer.robot, heard.serves)
-                if not self._rate_of(peer.robot):
+                if not peer.rate:
                     return
             if heard.kind is not Kind.SIGN:
                 self.messages += 1
@@ -435,9 +436,9 @@ class DomainEnd(Endpoint):
         self, replica: Replica, provenance: Provenance, samples: list[ReceivedTransform], live: bool
     ) -> list[ReceivedTransform]:
         """Note the samples of a batch; returns those that are to be published if they are news."""
-        samples = [sample for sample in samples if self._is_wanted(sample)]
+        samples = self._wanted(samples)
         rank, peer = provenance.rank, provenance.peer
-        if provenance.origin == self.relay.origin:
+        if provenance.origin == self.relay.origin or (live and replica.note_moving(samples, rank)):
             return samples
         kept: list[ReceivedTransform] = []
         for sample in samples:
@@ -460,8 +461,9 @@ class DomainEnd(Endpoint):
         moves = entry.sample is not None and not entry.sample.static
         return moves and (entry.origin == origin or self.relay.reaches(origin))
 
-    def _is_wanted(self, sample: ReceivedTransform) -> bool:
-        return self.frames is None or sample._fields[1] in self.frames
+    def _wanted(self, samples: list[ReceivedTransform]) -> list[ReceivedTransform]:
+        frames = self.frames
+        return samples if frames is None else [sample for sample in samples if sample._fields[1] in frames]
 
     def _take_removal(self, peer: Peer, replica: Replica, removal: RemovedFrame) -> bool:
         if self.frames is not None and removal.frame not in self.frames:
@@ -524,14 +526,13 @@ class DomainEnd(Endpoint):
 
     def _is_thinned(self, peer: Peer, heard: Heard) -> bool:
         """Whether a message with newest samples comes before its time."""
-        rate = self._rate_of(peer.robot)
-        if heard.number or rate == inf:
+        if heard.number or peer.rate == inf:
             return False
         now = self._now()
         since = now - self._thinned.get(peer.id, -inf)
         # Samples that belong together come in several messages at once.
         if since > 0.02:
-            if since < 0.9 / rate:
+            if since < 0.9 / peer.rate:
                 return True
             self._thinned[peer.id] = now
         return False
@@ -650,8 +651,8 @@ class DomainEnd(Endpoint):
             for entry in heard.entries:
                 if isinstance(entry, ReceivedBatch) and self._admit_number(peer, entry.sequence, len(entry.samples)):
                     assert entry.origin is not None
-                    samples = [sample for sample in entry.samples if self._is_wanted(sample)]
-                    batches.append((Provenance(entry.origin, entry.sequence, self.outbox, peer), samples))
+                    source = Provenance(entry.origin, entry.sequence, self.outbox, peer)
+                    batches.append((source, self._wanted(entry.samples)))
             self._publish(peer, batches, live=False, past=True)
             goes_on = goes_on or self._history.goes_on(peer.id, heard)
         finally:

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
+from math import inf
 
 from tfbus.bus.subscribers import SeenKeys
 
@@ -22,6 +23,8 @@ class Peer:
         Whether it has announced that it is there.
     robot : str
         The robot whose link it is; empty without one.
+    rate : float
+        How often its newest samples are wanted, in Hz; infinite for everything, 0 for nothing.
     number : int
         That of its newest live message; 0 before the first.
     authorities : set of str
@@ -36,12 +39,13 @@ class Peer:
         The reasons of refusals that were reported.
     """
 
-    __slots__ = ("authorities", "authority_text", "frames", "id", "number", "paths", "present", "reported", "robot")
+    __slots__ = ("authorities", "authority_text", "frames", "id", "number", "paths", "present", "rate", "reported", "robot")
 
     def __init__(self, id: str) -> None:  # noqa: A002 - the wire calls it so
         self.id = id
         self.present = False
         self.robot = ""
+        self.rate = inf
         self.number = 0
         self.authorities: set[str] = set()
         self.authority_text = 0
