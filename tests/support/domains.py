@@ -181,6 +181,9 @@ class Wire:
     def is_heard(self, channel: str) -> bool:
         return any(other.channel_of(self) == channel for other in self.network.wires if other is not self)
 
+    def is_behind(self) -> bool:
+        return False
+
     def publish(self, channel: str, message: bytes) -> None:
         for other in self.network.wires:
             if other is not self and other.channel_of(self) == channel and self.id in other.met:
@@ -286,6 +289,9 @@ class Host:
     def send_soon(self, pending: int) -> None:
         del pending
         self._process.sending = True
+
+    def is_behind(self) -> bool:
+        return len(self._queue) > 0
 
     def stir(self) -> None:
         self._process.due = self._process.world.now

@@ -244,9 +244,9 @@ class Replica:
         number, origin = rank
         entries, fresh, make = self.entries, self._fresh, tuple.__new__
         for sample in samples:
-            _, child, _, _, _, static = sample._fields
+            child = sample.child
             known = entries.get(child)
-            if known is None or static or known.origin != origin or known.number >= number or known.sample is None:
+            if known is None or sample.static or known.origin != origin or known.number >= number or known.sample is None:
                 return False
             entries[child] = make(Entry, (number, origin, sample, False))
             fresh[child] = None
