@@ -80,7 +80,7 @@ MOST_REMEMBERED = 1_000
 PATIENCE = 3.0
 """s; so long a link waits for an answer."""
 LONGEST_DELAY = 10.0
-"""s; so long a link that has no time to read puts a question off."""
+"""s; so long a link that has no time to read puts all its questions off, and then asks one."""
 _LONGEST_PAUSE = 60.0
 _ASK_AGAIN = 30.0
 _SPARE = 1_000
@@ -421,7 +421,6 @@ class _Copy:
         "due",
         "frames",
         "fruitless",
-        "latest",
         "missed",
         "must_ask",
         "replica",
@@ -441,9 +440,8 @@ class _Copy:
         self.seen = seen
         self.claim: Claim | None = None
         self.due = inf
-        # Whether the question is not put off, and until when it is.
+        # Whether the question is not put off.
         self.urgent = False
-        self.latest = inf
         self.missed = False
         # Answers without news, and questions without an answer, one after the other.
         self.fruitless = 0
@@ -468,6 +466,8 @@ class Agreement:
         self._remembered: dict[str, tuple[Replica, int]] = {}
         self._asked: Question | None = None
         self._patience = _NEVER
+        # One of the questions that were put off is asked then.
+        self._latest = inf
         self._is_new = True
 
     def joined(self, peer: str, replica: Replica, now: float, must_ask: bool = False) -> None:
@@ -565,11 +565,11 @@ class Agreement:
                 return None
             copy = self._copies[peer]
             again = copy.again <= now
-            if is_behind and not (again or copy.urgent) and now < copy.latest:
-                copy.latest = min(copy.latest, now + LONGEST_DELAY)
+            if is_behind and not (again or copy.urgent) and now < self._latest:
+                self._latest = min(self._latest, now + LONGEST_DELAY)
                 copy.due = now + uniform(0.05, 0.1)
                 continue
-            copy.due = copy.again = copy.latest = inf
+            copy.due = copy.again = self._latest = inf
             copy.urgent = False
             if again or copy.missed or not self._agrees(copy, now):
                 self._asked, self._patience = Question(peer, copy.seen), now + PATIENCE
