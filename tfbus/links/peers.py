@@ -39,7 +39,18 @@ class Peer:
         The reasons of refusals that were reported.
     """
 
-    __slots__ = ("authorities", "authority_text", "frames", "id", "number", "paths", "present", "rate", "reported", "robot")
+    __slots__ = (
+        "authorities",
+        "authority_text",
+        "frames",
+        "id",
+        "number",
+        "paths",
+        "present",
+        "rate",
+        "reported",
+        "robot",
+    )
 
     def __init__(self, id: str) -> None:  # noqa: A002 - the wire calls it so
         self.id = id

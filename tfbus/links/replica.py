@@ -246,7 +246,13 @@ class Replica:
         for sample in samples:
             child = sample.child
             known = entries.get(child)
-            if known is None or sample.static or known.origin != origin or known.number >= number or known.sample is None:
+            if (
+                known is None
+                or sample.static
+                or known.origin != origin
+                or known.number >= number
+                or known.sample is None
+            ):
                 return False
             entries[child] = make(Entry, (number, origin, sample, False))
             fresh[child] = None
@@ -559,16 +565,17 @@ class Agreement:
             if now < self._patience:
                 return None
             self.unanswered(self._asked.peer, now)
+        if is_behind and now < self._latest:
+            self._latest = min(self._latest, now + LONGEST_DELAY)
+            for copy in self._copies.values():
+                if copy.due <= now and not copy.urgent:
+                    copy.due = now + uniform(0.1, 0.2)
         while True:
             peer = min(self._copies, key=self._due_of, default=None)
             if peer is None or self._due_of(peer) > now:
                 return None
             copy = self._copies[peer]
             again = copy.again <= now
-            if is_behind and not (again or copy.urgent) and now < self._latest:
-                self._latest = min(self._latest, now + LONGEST_DELAY)
-                copy.due = now + uniform(0.05, 0.1)
-                continue
             copy.due = copy.again = self._latest = inf
             copy.urgent = False
             if again or copy.missed or not self._agrees(copy, now):
