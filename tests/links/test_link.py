@@ -1,6 +1,6 @@
 import logging
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import count, pairwise
 from typing import Any
 
@@ -13,6 +13,7 @@ from support.processes import until
 from support.samples import moving, static
 
 from tfbus import Bus, PeerJoined, PeerLost, PeerRejected, SimulatedClock
+from tfbus._aio.turn_budget import TurnBudget
 from tfbus.links import Link
 from tfbus.links.carrier import Presence, Received, ReceivedMessage, SendReport
 from tfbus.links.endpoint import ForeignEnd
