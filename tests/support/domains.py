@@ -263,9 +263,11 @@ class Host:
         self._end = end
         self._queue = ReceiveQueue(10_000)
         self._handles = False
+        self.received = 0
         end.host = self
 
     def receive(self, item: Received) -> None:
+        self.received += 1
         if self._process.stopped and len(self._queue) >= BACKLOG and isinstance(item.content, bytes):
             return
         self._queue.put(item)
@@ -326,6 +328,11 @@ class Process:
         self.removed: list[str] = []
         self._hosts = [Host(self, end) for end in self.ends]
         self.bus.subscribe(self._note, self._note_removal)
+
+    @property
+    def received(self) -> int:
+        """So many items of its networks and worlds had to wait for its event loop."""
+        return sum(host.received for host in self._hosts)
 
     @property
     def end(self) -> DomainEnd:

@@ -178,6 +178,8 @@ class DomainEnd(Endpoint):
         self.lookups = RemoteLookups(wire.send, wire.id, name)
         self._news: dict[str, bool] = {}
         self._thinned: dict[str, float] = {}
+        # The last sign of each peer of which nothing is wanted: the same sign once more need not wake the event loop.
+        self._resting: dict[str, bytes] = {}
         # Answers take half of the time of the event loop at most.
         self._questions: dict[tuple[str, Kind], bytes] = {}
         self._answers_due = -inf
@@ -241,7 +243,16 @@ class DomainEnd(Endpoint):
         return due
 
     def split(self, item: Received) -> Iterator[Any]:
-        return read_message(item.content) if isinstance(item.content, bytes) else iter((item.content,))
+        if not isinstance(item.content, bytes):
+            return iter((item.content,))
+        return read_message(item.content) if item.moving or item.urgent else self._split_sign(item)
+
+    def _split_sign(self, item: Received) -> Iterator[Any]:
+        for part in read_message(item.content):
+            yield part
+            # Who tells the time may be followed later.
+            if isinstance(part, Heard) and part.time is None and self._agreement.rests(item.sender, self._now()):
+                self._resting[item.sender] = item.content
 
     def _warn_of_wire(self, error: Exception) -> None:
         self._log.warning(str(error), "the link %s: %s", self.name, error)
@@ -311,6 +322,8 @@ class DomainEnd(Endpoint):
         """Take an item of the wire, from any thread."""
         if isinstance(item, bytes):
             kind = kind_of(item)
+            if kind is Kind.SIGN and self._resting.get(link) == item:
+                return
             urgent = kind in _URGENT
             received = Received(link, item, len(item), kind is Kind.LIVE, urgent, kind in _FOLLOWS)
         elif isinstance(item, Left):
@@ -386,8 +399,11 @@ class DomainEnd(Endpoint):
     def _take_held(self, peer: Peer, heard: Heard) -> None:
         now = self._now()
         live = heard.kind is Kind.LIVE
+        if not live:
+            self._resting.pop(peer.id, None)
         if not heard.continues and (live or heard.kind is Kind.SIGN) and self._count_gap(peer, heard.number, live):
             self._agreement.missed(peer.id, now)
+            self._resting.pop(peer.id, None)
             self.host.stir()
         if heard.kind is Kind.PAST:
             self._take_past(peer, heard)
@@ -570,6 +586,7 @@ class DomainEnd(Endpoint):
         self._agreement.left(peer.id)
         self.lookups.left(peer.id)
         self._news.pop(peer.id, None)
+        self._resting.pop(peer.id, None)
         self._thinned.pop(peer.id, None)
         self._forget_robots(peer.robot)
         lost = {bus for bus in peer.paths if self.relay.way_closed(bus)}

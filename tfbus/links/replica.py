@@ -593,6 +593,17 @@ class Agreement:
                 return self._asked
             copy.seen = max(copy.seen, 0 if copy.claim is None else copy.claim.sequence)
 
+    def rests(self, peer: str, now: float) -> bool:
+        """Whether nothing is wanted of a peer, so that its last sign would say nothing if it came once more."""
+        copy = self._copies.get(peer)
+        return (
+            copy is not None
+            and copy.due == copy.again == inf
+            and not (copy.missed or copy.silences)
+            and (self._asked is None or self._asked.peer != peer)
+            and self._agrees(copy, now)
+        )
+
     def next_due(self) -> float:
         """The time at which `question` has to be called next."""
         if self._asked is not None:
