@@ -15,6 +15,7 @@ from tfbus import (
 from tfbus.tree.forest import LoopingSample
 from tfbus.tree.history import FrameHistory
 from tfbus.waiting.live_tree import LiveTree, Waiter
+from tfbus.waiting.watch_index import WatchState
 
 
 def park(live: LiveTree, target: str, source: str, at: int, woken: list[str]) -> None:
@@ -114,6 +115,23 @@ def test_an_error_of_one_waiter_does_not_keep_others_from_being_woken() -> None:
     live.waiting.park(Waiter(Question("map", "a", 9), 0, fail), caught.value)
     park(live, "map", "a", 9, woken)
     live.insert((moving("map", "a", 9),))
+    assert woken == ["a"]
+
+
+def test_an_error_of_one_watch_does_not_keep_others_from_being_woken() -> None:
+    live = live_tree(None)
+    live.insert((moving("map", "a", 1),))
+    woken: list[str] = []
+
+    def fail() -> None:
+        raise RuntimeError("Event loop is closed")
+
+    for wake in (fail, lambda: woken.append("a")):
+        state = WatchState("map", "a", wake)
+        live.watching.add(state)
+        live.watching.set_answer(state, live.forest, 1)
+        state.outdated = False
+    live.insert((moving("map", "a", 2),))
     assert woken == ["a"]
 
 
