@@ -32,7 +32,7 @@ from tfbus.links.message import Kind, write_body
 from tfbus.links.rmw_zenoh import RmwZenohLink
 from tfbus.links.rosbridge import RosbridgeLink
 from tfbus.links.zenoh import ZenohLink, ZenohRouter
-from tfbus.links.zenoh.addresses import client_config, open_session
+from tfbus.links.zenoh.sessions import client_config, open_session
 from tfbus.view import View
 
 ROOT = Path(__file__).parents[2]

@@ -4,7 +4,7 @@ from support.asking import settle
 from support.processes import until
 
 from tfbus import SECOND, Buffer, Bus, ClockResetError, SimulatedClock
-from tfbus.links.clock_follower import FAR, ClockFollower
+from tfbus.links.link import FAR, ClockFollower
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 

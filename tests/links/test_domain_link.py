@@ -20,8 +20,8 @@ from support.samples import moving, static
 from tfbus import Bus, BusClosedError, PeerJoined, PeerLost, PeerRejected, SimulatedClock
 from tfbus.links import DomainLink
 from tfbus.links.message import MAX_SAMPLES, Kind, Outgoing, kind_of, write_message
-from tfbus.links.outbox import OutgoingBatch
-from tfbus.links.wire import Hearing, Receive
+from tfbus.links.relay import OutgoingBatch
+from tfbus.links.seams import Hearing, Receive
 
 pytestmark = pytest.mark.anyio
 EVERYTHING = [Hearing("*", "all")]

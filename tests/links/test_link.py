@@ -14,9 +14,9 @@ from support.samples import moving, static
 
 from tfbus import Bus, PeerJoined, PeerLost, PeerRejected, SimulatedClock
 from tfbus.links import Link
-from tfbus.links.carrier import Presence, Received, ReceivedMessage, SendReport
 from tfbus.links.endpoint import ForeignEnd
-from tfbus.links.outbox import Turn
+from tfbus.links.relay import Turn
+from tfbus.links.seams import Presence, Received, ReceivedMessage, SendReport
 from tfbus.tf_message import MalformedMessageError
 
 pytestmark = pytest.mark.anyio

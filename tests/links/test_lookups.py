@@ -29,9 +29,19 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.links import BufferServer, DomainLink, lookups
-from tfbus.links.message import Kind, Outgoing, kind_of, write_body, write_message
-from tfbus.links.remote_lookup import Cancellation, RemoteQuestion, read_answer, write_answer, write_question
-from tfbus.links.wire import Hearing
+from tfbus.links.message import (
+    Cancellation,
+    Kind,
+    Outgoing,
+    RemoteQuestion,
+    kind_of,
+    read_answer,
+    write_answer,
+    write_body,
+    write_message,
+    write_question,
+)
+from tfbus.links.seams import Hearing
 
 pytestmark = pytest.mark.anyio
 

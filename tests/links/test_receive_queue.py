@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.links.carrier import MANY, Presence, Received, ReceiveQueue
+from tfbus.links.link import MANY, ReceiveQueue
+from tfbus.links.seams import Presence, Received
 from tfbus.statistics import QueueStatistics
 
 MIB = 2**20

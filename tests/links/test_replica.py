@@ -11,7 +11,7 @@ from support.processes import peak_of
 from support.samples import moving, static
 
 from tfbus import TransformStamped
-from tfbus.links.outbox import OutgoingBatch, RemovedFrame
+from tfbus.links.relay import OutgoingBatch, RemovedFrame
 from tfbus.links.replica import (
     CHUNK,
     MANY_ORIGINS,

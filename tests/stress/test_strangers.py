@@ -21,15 +21,26 @@ from tfbus import LATEST, Buffer, Bus, PeerRejected
 from tfbus.links import BufferServer, DomainLink
 from tfbus.links.channels import MOST_FILTERS
 from tfbus.links.domain import SOONEST_SIGN
+from tfbus.links.endpoint import MAX_PEERS, MOST_AUTHORITY_TEXT, Peers
 from tfbus.links.history import MOST_HELD_SAMPLES, HistoryAsker
 from tfbus.links.local import LocalLink
-from tfbus.links.message import NOTHING, Entry, Heard, Kind, Outgoing, kind_of, write_body, write_message, write_text
-from tfbus.links.outbox import OutgoingBatch, RemovedFrame
-from tfbus.links.peers import MAX_PEERS, MOST_AUTHORITY_TEXT, Peers
-from tfbus.links.relay import ReceivedBatch
-from tfbus.links.remote_lookup import Cancellation, RemoteQuestion, write_question
+from tfbus.links.message import (
+    NOTHING,
+    Cancellation,
+    Entry,
+    Heard,
+    Kind,
+    Outgoing,
+    RemoteQuestion,
+    kind_of,
+    write_body,
+    write_message,
+    write_question,
+    write_text,
+)
+from tfbus.links.relay import OutgoingBatch, ReceivedBatch, RemovedFrame
 from tfbus.links.replica import MANY_ORIGINS, MOST_REMOVALS, SETTLING, Claim, Places, Replica, TooManyEntriesError
-from tfbus.links.wire import Hearing, Joined, Left
+from tfbus.links.seams import Hearing, Joined, Left
 
 pytestmark = pytest.mark.anyio
 

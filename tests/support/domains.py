@@ -15,13 +15,13 @@ from support.foreign_world import ForeignCarrier, ForeignMessage, ForeignWorld
 
 from tfbus import Bus, SimulatedClock, Transform, TransformStamped, UnknownFrameError
 from tfbus.geometry.stamped import Batch
-from tfbus.links.carrier import Received, ReceiveQueue
 from tfbus.links.domain import DomainEnd
 from tfbus.links.endpoint import Endpoint, ForeignEnd
+from tfbus.links.link import ReceiveQueue
 from tfbus.links.message import NOTHING, Kind, Outgoing, kind_of, write_message
-from tfbus.links.outbox import OutgoingBatch, RemovedFrame
+from tfbus.links.relay import OutgoingBatch, RemovedFrame
 from tfbus.links.replica import Claim
-from tfbus.links.wire import Hearing, Joined, Left, Receive, WireItem
+from tfbus.links.seams import Hearing, Joined, Left, Receive, Received, WireItem
 from tfbus.tf_message import MalformedMessageError
 
 SECOND = 10**9
@@ -146,7 +146,7 @@ class Network:
 
 
 class Wire:
-    """See `tfbus.links.wire.Wire`; the end of the link that uses it calls it without an event loop."""
+    """See `tfbus.links.seams.Wire`; the end of the link that uses it calls it without an event loop."""
 
     def __init__(self, network: Network, robot: str = "") -> None:
         self.network = network

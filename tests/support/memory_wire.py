@@ -6,7 +6,7 @@ from fnmatch import fnmatchcase
 
 import anyio
 
-from tfbus.links.wire import Hearing, Joined, Left, Receive
+from tfbus.links.seams import Hearing, Joined, Left, Receive
 
 
 class MemoryNetwork:
@@ -64,7 +64,7 @@ class MemoryNetwork:
 
 
 class MemoryWire:
-    """See `tfbus.links.wire.Wire`."""
+    """See `tfbus.links.seams.Wire`."""
 
     receive: Receive
 

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.carrier import Presence, Received
 from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
-from tfbus.links.endpoint import Endpoint
+from tfbus.links.endpoint import MAX_PEERS, Endpoint
 from tfbus.links.history import HistoryAsker, HistoryTeller
 from tfbus.links.lookups import Answers, RemoteLookups
 from tfbus.links.message import (
@@ -27,11 +26,19 @@ from tfbus.links.message import (
     write_message,
     write_text,
 )
-from tfbus.links.outbox import Outbox, OutgoingBatch, Rank, RemovedFrame, Turn
-from tfbus.links.peers import MAX_PEERS, Peer
-from tfbus.links.relay import Provenance, ReceivedBatch, ReceivedTransform
+from tfbus.links.relay import (
+    Outbox,
+    OutgoingBatch,
+    Peer,
+    Provenance,
+    Rank,
+    ReceivedBatch,
+    ReceivedTransform,
+    RemovedFrame,
+    Turn,
+)
 from tfbus.links.replica import CHUNK, Agreement, Claim, Entry, Places, Replica, TooManyEntriesError
-from tfbus.links.wire import Hearing, Joined, Left, Wire, WireItem
+from tfbus.links.seams import Hearing, Joined, Left, Presence, Received, Wire, WireItem
 from tfbus.tf_message import MalformedMessageError
 
 SIGN_PERIOD = 1.0

@@ -61,9 +61,14 @@ from math import inf
 from random import uniform
 from typing import NamedTuple
 
+try:
+    # hashlib has it too, but loads OpenSSL for others, which takes 0.6 MB of each process with a link.
+    from _blake2 import blake2b
+except ImportError:  # A Python that has it elsewhere.
+    from hashlib import blake2b
+
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.hashes import hash_bytes
-from tfbus.links.outbox import OutgoingBatch, Rank, RemovedFrame
+from tfbus.links.relay import OutgoingBatch, Rank, RemovedFrame
 
 SETTLING = 1.5
 """s; a frame that moves less often than that is in the digests between its samples."""
@@ -380,6 +385,11 @@ class Replica:
     def _is_removed(self, frame: str, rank: Rank) -> bool:
         entry = self.entries.get(frame)
         return entry is not None and entry.sample is None and (entry.number, entry.origin) == rank
+
+
+def hash_bytes(data: bytes, size: int) -> bytes:
+    """The BLAKE2b hash (RFC 7693) of some bytes, the same in every process; `size` is its own, from 1 to 64 bytes."""
+    return blake2b(data, digest_size=size).digest()
 
 
 def _first(logged: tuple[int, str]) -> int:

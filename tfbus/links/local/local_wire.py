@@ -57,10 +57,9 @@ import anyio
 import anyio.lowlevel
 
 from tfbus._aio.turn_budget import TurnBudget
-from tfbus.links.local.connection import Connection, Hello, frame_of
+from tfbus.links.local.connection import Connection, Hello, Poll, frame_of
 from tfbus.links.local.meeting_place import MeetingPlace
-from tfbus.links.local.poll import Poll
-from tfbus.links.wire import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
 from tfbus.tf_message import MalformedMessageError
 
 MOST_CONNECTIONS: Final = 1_000

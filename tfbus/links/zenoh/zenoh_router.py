@@ -8,8 +8,7 @@ from typing import Any, Final, Self
 import anyio
 import anyio.to_thread
 
-from tfbus.links.zenoh._closing import Keeper, close_session
-from tfbus.links.zenoh.addresses import Addresses, open_session, router_config
+from tfbus.links.zenoh.sessions import Addresses, Keeper, close_session, open_session, router_config
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
 """The address of a router that is given none: only processes of this machine reach it."""

@@ -15,8 +15,8 @@ from tfbus import (
     Transform,
     TransformStamped,
 )
-from tfbus.links.remote_lookup import (
-    MAX_BYTES,
+from tfbus.links.message import (
+    MAX_LOOKUP,
     Cancellation,
     RemoteQuestion,
     as_timeout,
@@ -42,9 +42,9 @@ def test_a_question_and_its_cancellation_are_read_as_they_were_written(message: 
 
 
 def test_so_large_a_message_is_read_and_no_larger_one() -> None:
-    largest = write_question(Cancellation("me", 2)).ljust(MAX_BYTES)
+    largest = write_question(Cancellation("me", 2)).ljust(MAX_LOOKUP)
     assert read_question(largest) == Cancellation("me", 2)
-    with pytest.raises(ValueError, match=f"{MAX_BYTES + 1} bytes, more than {MAX_BYTES}"):
+    with pytest.raises(ValueError, match=f"{MAX_LOOKUP + 1} bytes, more than {MAX_LOOKUP}"):
         read_question(largest + b" ")
 
 
@@ -61,7 +61,7 @@ def test_so_large_a_message_is_read_and_no_larger_one() -> None:
         b'{"type": %b, "message": "m", "cause": null}' % (b"[" * 300 + b"]" * 300),
         b'{"type": "ValueError", "message": ["m"]}',
         b'{"type": {}, "message": "m"}',
-        write_question(Cancellation("m" * MAX_BYTES, 1)),
+        write_question(Cancellation("m" * MAX_LOOKUP, 1)),
     ],
 )
 def test_other_bytes_are_no_question_and_no_answer(data: bytes) -> None:
