@@ -29,14 +29,6 @@ class MemoryNetwork:
         for deliver in self.stopped.pop(link):
             deliver()
 
-    def cut_off(self, *links: str) -> None:
-        """Part some links from all others."""
-        inside, outside = set(links), set(self.wires) - set(links)
-        for one, other in [(one, other) for one in inside for other in outside]:
-            self.cut |= {(one, other), (other, one)}
-            self.wires[one].part(other)
-            self.wires[other].part(one)
-
     def heal(self) -> None:
         self.cut.clear()
         for one in self.wires.values():

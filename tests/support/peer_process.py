@@ -29,7 +29,6 @@ from tfbus import (
     PeerRejected,
     SystemClock,
     Transform,
-    TransformBroadcaster,
     TransformStamped,
     UnknownFrameError,
 )
@@ -154,15 +153,6 @@ class Program:
             due = began + (number - start + 1) / rate
             await anyio.sleep(max(0.0, due - time.monotonic()))
         return {"longest_call": longest_call, "seconds": time.monotonic() - began}
-
-    async def do_churn(self, frame: str, times: int) -> None:
-        """Publish and remove a static frame many times; at last it exists, at x = `times`."""
-        broadcaster = TransformBroadcaster(self.bus, "churn")
-        for turn in range(times):
-            broadcaster.send_static("map", frame, Transform((float(turn), 0.0, 0.0)))
-            await anyio.lowlevel.checkpoint()
-            self.bus.remove_frame(frame)
-        broadcaster.send_static("map", frame, Transform((float(times), 0.0, 0.0)))
 
     async def do_remove(self, frame: str) -> None:
         # Another process may have been faster.
