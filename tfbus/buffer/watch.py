@@ -28,7 +28,7 @@ class Watch:
     Attributes
     ----------
     skipped : int
-        Number of batches that touched the watched path and that no answer shows, because a later batch had come.
+        Number of batches that touched the watched path but appear in no answer, because a later batch had come.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
-"""The poses of all frames in one of them: what a picture of the tree needs, and faster than a lookup for each frame.
+"""The poses of all frames in a fixed frame, for pictures of the tree; faster than a lookup for each frame.
 
-The tree is walked from the fixed frame outwards, edges above it upside down, so each edge is read once for each stamp
-at which it is needed, which is usually one. The samples are read under the lock and composed after that. While the
-structure of the tree stays, a picture of the newest samples reads nothing but them.
+The tree is walked from the fixed frame outwards, and the edges above that frame are inverted. Each edge is read once
+for each stamp at which it is needed: usually once. The samples are read under the lock and composed after that. While
+the structure of the tree stays, a picture of the newest samples reads nothing but these samples.
 """
 
 from collections.abc import Sequence
@@ -35,8 +35,8 @@ class Poses(NamedTuple):
     parents: npt.NDArray[np.intp]
     """The place of each frame's parent in `frames`, shape (n,); -1 for a root."""
     answered: npt.NDArray[np.bool_]
-    """Whether a lookup has this answer, shape (n,). Otherwise edges without a sample at the stamp keep their nearest
-    one; the columns are NaN where an edge has no sample at all."""
+    """Whether a lookup gives this pose, shape (n,). If not, an edge that does not cover the stamp is read at its
+    nearest sample; the columns are NaN where an edge has no sample at all."""
     static: npt.NDArray[np.bool_]
     """Whether the edge between each frame and its parent is static, shape (n,); False for a root."""
     heard: npt.NDArray[np.int64]
@@ -48,12 +48,12 @@ class _Plan(NamedTuple):
     """The order in which the frames are reached from the fixed frame."""
 
     topology: tuple[list[str], list[str]]
-    """All children, and the parent of each."""
+    """All children, and their parents."""
     frames: list[str]
     origins: list[int]
-    """The place of the frame from which each one is reached; its own for the first."""
+    """For each frame, the place of the frame from which the walk reaches it; for the first frame, its own."""
     edges: list[str]
-    """The child of the edge between the two."""
+    """For each frame, the child of the edge by which the walk reaches it."""
     inverted: list[bool]
     parents: npt.NDArray[np.intp]
 
@@ -111,7 +111,7 @@ class PoseReader:
             plan = self._plan(fixed, at)
             histories = [forest.frames.get(child) for child in plan.edges]
             gathered = _gather(plan, histories, at)
-            # A frame may have had another parent at the stamp, or two, by which it was in a loop.
+            # At the stamp, a frame may have had another parent, or two in a loop.
             reparented = any(history.mixed for history in forest.frames.values())
             corrections = [_find(forest, fixed, frame, at) for frame in plan.frames] if reparented else []
             static, heard = self._own_edges(plan, at)
@@ -171,7 +171,7 @@ def _make_plan(fixed: str, topology: tuple[list[str], list[str]]) -> _Plan:
 
 
 class _Gathered(NamedTuple):
-    """The edges of a plan, each as it is at the stamps at which the frames behind it need it."""
+    """The edges of a plan, each read at the stamps that the frames behind it need."""
 
     plan: _Plan
     rows: bytearray
@@ -179,7 +179,7 @@ class _Gathered(NamedTuple):
     places: list[int]
     """The place of the frame behind each edge."""
     origins: list[int]
-    """For each edge, the index of the one before it on the way from the fixed frame."""
+    """For each edge, the index of the edge before it on the way from the fixed frame."""
     answered: list[bool]
     own: list[int]
     """For each frame, the index of its edge at its own stamp."""
@@ -200,7 +200,7 @@ def _turn_round(rows: npt.NDArray[np.float64], places: npt.NDArray[np.intp]) -> 
 
 
 class _Newest:
-    """The poses of the newest samples, while no edge but those comes or changes.
+    """The poses by the newest samples, as long as the structure of the forest stays.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ class _Newest:
     ----------
     state : object
     moving : list of FrameHistory
-        Their newest records are what `poses` needs.
+        The moving edges; `poses` takes the newest record of each.
     """
 
     def __init__(self, state: object, plan: _Plan, histories: Sequence[FrameHistory | None]) -> None:

@@ -1,8 +1,8 @@
 """The velocity of a frame: the analytic derivative of the interpolation.
 
 Between two samples the origin moves on a straight line at a constant velocity, and slerp turns at a constant angular
-velocity about an axis that stands still in the parent. At a sample the derivative is the one from before; at the first
-sample of a window, or of a new parent, it is the one from after.
+velocity about an axis that stands still in the parent. At a sample, this is the left derivative; at the first sample of
+a window, or of a new parent, the right derivative.
 """
 
 import math
