@@ -117,7 +117,7 @@ def changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformSt
 
 
 def _possibly_looped(changes: Mapping[str, str], parents: Container[str]) -> list[str]:
-    """The changed children that may be in a loop: childless frames are removed until every remaining one has a child."""
+    """The changed children that may be in a loop: childless ones are removed until every remaining one has a child."""
     children = Counter(changes.values())
     childless = [child for child in changes if child not in parents and child not in children]
     left_out = set(childless)

@@ -34,7 +34,7 @@ _begin_of = itemgetter(0)
 class Runs:
     """The parents, or the authorities, of the samples of a history: one name for each run of samples that share it.
 
-    It is empty, and false, while all samples have the same name. The history itself holds the name of its newest sample.
+    It is empty, and false, while all samples have the same name. The history holds the name of its newest sample.
     """
 
     __slots__ = ("_runs",)

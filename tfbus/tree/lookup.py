@@ -65,7 +65,7 @@ class Policy:
     Parameters
     ----------
     tolerance : int
-        At a stamp that is not covered, or in a gap that is too long: the greatest distance of the sample that stands in.
+        The greatest distance of a sample that stands in, at a stamp that is not covered or lies in a gap too long.
     max_gap : int or None
         The greatest distance between two samples for interpolation; None for any distance.
     hold : int

@@ -7,9 +7,9 @@ A lookup that cannot be answered is parked under the frame that blocks it, and a
 * under an unknown frame, or under the roots of two trees: any sample of these frames wakes the lookup.
 
 A lookup also ends when the window of another edge on its path moves past the stamp. So each edge has a limit: a sample
-newer than the limit drops the stamp. One list for all frames holds the first limit of each waiter, so an insertion costs
-one comparison while no limit is passed. Once a frame has passed the first limit of a waiter, that waiter is kept under
-each edge whose limit is not yet passed, such as an edge that has stopped.
+newer than the limit drops the stamp. One list for all frames holds the first limit of each waiter, so an insertion
+costs one comparison while no limit is passed. Once a frame has passed the first limit of a waiter, that waiter is kept
+under each edge whose limit is not yet passed, such as an edge that has stopped.
 
 `LiveTree.insert` pops the waiters that may have an answer now and wakes them, each with its answer if that is plain. To
 wake a waiter is to call the function that it brought along: nothing here knows an event loop, and nothing waits.
