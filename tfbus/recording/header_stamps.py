@@ -24,9 +24,9 @@ class HeaderStamps(NamedTuple):
     stamps: npt.NDArray[np.int64]
     """ns, in the order of the log times."""
     from_headers: bool
-    """Whether they are those of the headers; else the messages have no header, and these are their log times."""
+    """Whether the stamps are from headers. If not, the messages have no header, and the stamps are their log times."""
     unreadable: int
-    """The number of messages that are too short and of damaged places of the file, which are left out."""
+    """The number of messages that are too short, and of damaged places of the file; both are left out."""
 
 
 def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:

@@ -122,7 +122,7 @@ class ChunkPacker:
             return lost_chunk(chunk.place, low, error)
 
     def _place(self, channel: Channel | None) -> int:
-        """The place of a channel in the table of packed messages; -1 for one that is not read."""
+        """The place of a channel in the table of packed messages; -1 for a channel that is not read."""
         if channel is None:
             return -1
         if channel not in self._places:
@@ -147,7 +147,7 @@ _KINDS: Final[dict[int, str]] = {
 """The names of the records that are read."""
 _FIRST_BLOCK: Final = 2**16
 _BLOCK: Final = 2**21
-"""Bytes that are decoded at once: few at first, for the first message of each frame has to be judged by itself."""
+"""Bytes that are decoded at once: few at first, because the first message of each frame has to be judged by itself."""
 
 
 class IndexedChunk(NamedTuple):
@@ -156,7 +156,7 @@ class IndexedChunk(NamedTuple):
     place: ChunkPlace
     length: int
     size: int
-    """Of its content, in bytes."""
+    """The size of its content, in bytes."""
     channels: tuple[int, ...]
 
 
@@ -321,7 +321,7 @@ _FOOTER_LENGTH: Final = 20
 _ANY: Final = Channel("", "", "")
 _PIECE: Final = 2**16
 _MOST_OVERLAPPING: Final = 16
-"""Chunks; if more have to be in memory at once, their messages are merged one by one."""
+"""The greatest number of chunks in memory at once; if more overlap, their messages are merged one by one."""
 
 
 class McapStorage:
@@ -464,7 +464,7 @@ class McapStorage:
         return True
 
     def _checksum(self, start: int, end: int) -> int:
-        # In pieces: a large one in memory would, once it is freed, keep `malloc` from giving large ones back.
+        # In pieces: after a large block is freed, `malloc` no longer returns large blocks to the system.
         self._file.seek(start)
         checksum = 0
         while start < end and (piece := self._file.read(min(_PIECE, end - start))):
@@ -586,7 +586,7 @@ class McapStorage:
         return self._chunks
 
     def records_from(self, at: int) -> Iterator[tuple[int, int, bytes | None]]:
-        """The records from an offset on, as `read_records`; other readers of the file may come between."""
+        """The records from an offset on, as `read_records`; other readers may move the file's position meanwhile."""
         while True:
             self._file.seek(at)
             try:

@@ -8,8 +8,8 @@
   converted to it first.
 * `ColumnDecoder` decodes many messages at once, with numpy. Most messages of a channel differ only in their stamps and
   numbers: the same frames are at the same bytes. So messages of one size are stacked to a matrix of bytes, and each
-  transform of the message becomes two slices of it. It gives the same bits as `ChannelDecoder`, or None for a block
-  with anything unusual, or that may be invalid; then `ChannelDecoder` takes the block.
+  transform of the message becomes two slices of it. It gives the same bits as `ChannelDecoder`. For a block with
+  anything unusual or possibly invalid it gives None, and `ChannelDecoder` decodes that block.
 """
 
 import json
@@ -280,7 +280,7 @@ class ChannelDecoder:
     static : bool
         Whether its transforms are static.
     prefix : str
-        Put before the names of all frames, after leading slashes are removed.
+        A prefix for the names of all frames, after leading slashes are removed.
 
     Attributes
     ----------
@@ -343,7 +343,7 @@ class ChannelDecoder:
 
 
 def _authorities(channel: Channel) -> tuple[Run, ...]:
-    """The authorities in the metadata of a channel; the node that sent it, in ROS 1."""
+    """The authorities in the metadata of a channel; in ROS 1, the sending node."""
     text = channel.metadata.get(AUTHORITIES)
     if text is None:
         return ((channel.metadata.get("callerid", "").removeprefix("/"), 1),)
@@ -588,7 +588,7 @@ def _fixed(matrix: npt.NDArray[np.uint8], ranges: Ranges) -> npt.NDArray[np.uint
 
 
 def _layout_of(payload: bytes, decoder: ChannelDecoder) -> _Layout | None:
-    """The layout of a message; None if it has none of the usual ones."""
+    """The layout of a message; None if it is unusual."""
     ros1 = decoder.channel.encoding == "ros1"
     if not ros1 and payload[:2] != b"\0\1":
         return None
@@ -630,7 +630,7 @@ def _layout_of(payload: bytes, decoder: ChannelDecoder) -> _Layout | None:
 
 
 def _values(matrix: npt.NDArray[np.uint8], slot: _Slot, signed: bool) -> _Values:
-    """One transform of each message; in those of another structure, it is any bytes."""
+    """One transform of each message; meaningless for messages of another structure."""
     times = np.ascontiguousarray(matrix[:, slot.stamp : slot.stamp + 8]).view("<u4")
     rows = np.ascontiguousarray(matrix[:, slot.numbers : slot.numbers + 56]).view("<f8")
     nanoseconds = times[:, 1]
