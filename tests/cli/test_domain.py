@@ -115,7 +115,7 @@ def test_an_address_in_use_is_a_usage_error(backend: str, tfbus: Command) -> Non
 def test_without_its_extra_joining_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tfbus.links.zenoh", None)
     for options in (LinkOptions(connect=(NOBODY,)), LinkOptions(listen=(NOBODY,))):
-        with pytest.raises(UsageError, match=re.escape('need a package more: pip install "tfbus[cli,zenoh]"')):
+        with pytest.raises(UsageError, match=re.escape('need one more package: pip install "tfbus[cli,zenoh]"')):
             join(options)
 
 

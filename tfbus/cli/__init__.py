@@ -1,16 +1,16 @@
-"""The command ``tfbus``; of its subcommands in `tfbus.cli.commands` only the one that is called is loaded.
+"""The command ``tfbus``. Of the subcommands in `tfbus.cli.commands`, it loads only the one that is called.
 
 Standard output carries the result of a command; notices, warnings and errors go to standard error.
 """
 
-# Not `signal`, which loads enum: meanwhile Ctrl-C would still be a traceback.
+# `signal` would load enum, and Ctrl-C would still show a traceback meanwhile.
 import _signal as signal  # type: ignore[import-not-found]
 import gc
 import sys
 
 
 def main() -> None:
-    """Run the command and exit with the status that its help names; Ctrl-C ends it at any instant without a traceback.
+    """Run the command and exit with the status that its help names; Ctrl-C never shows a traceback.
 
     While modules are loaded, and after the command has ended, Ctrl-C has its default action, which is silent: a
     `KeyboardInterrupt` would show a traceback there.
@@ -25,7 +25,7 @@ def main() -> None:
 
     if heard:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    # Modules are no garbage: to search them for some while they are loaded takes a sixth of the time of the help.
+    # Modules are never garbage: a collection while they are loaded takes a sixth of the time of the help.
     gc.disable()
     from tfbus.cli.application import run
 

@@ -46,7 +46,7 @@ def fitted(line: str, indent: int = 2) -> str:
 
 
 def say(line: str) -> None:
-    """Print a notice to standard error, in one line whatever names are in it."""
+    """Print a notice to standard error, in one line, even if a name in it has line breaks."""
     print(printable(line), file=sys.stderr, flush=True)
 
 
@@ -75,7 +75,7 @@ def cells(text: str) -> int:
 
 
 def shorten(text: str, width: int) -> str:
-    """Cut the middle of a text out, where it is longer than `width`: both ends of a name tell it from others."""
+    """Cut out the middle of a text that is longer than `width`: the ends of a name distinguish it from others."""
     if cells(text) <= width:
         return text
     if width <= 1:
@@ -140,7 +140,7 @@ class Column(NamedTuple):
     right : bool
         Whether its cells stand at the right.
     importance : int or None
-        Where the table is too wide, the column with the lowest number goes first; None stays always.
+        If the table is too wide, the column with the lowest number is dropped first; a column with None never is.
     """
 
     title: str
@@ -159,7 +159,7 @@ def table_lines(
     rows : sequence of sequence of str
         The cells of each row; names need not be printable.
     width : int, optional
-        The greatest length of a line; where columns that stay always do not fit, their longest cells are shortened.
+        The greatest length of a line; if columns that are never dropped do not fit, their longest cells are shortened.
     titles : bool
         Whether the first line has the titles.
     """
@@ -230,7 +230,7 @@ def csv_writer() -> Any:
 
 
 def csv_name(name: str) -> str:
-    """A name as a cell of CSV: as it is for programs and files, and escaped on a terminal, which would obey it."""
+    """A name as a cell of CSV: unchanged for programs and files; escaped for a terminal, which would obey it."""
     return printable(name) if sys.stdout.isatty() else name
 
 
@@ -282,7 +282,7 @@ def write_file(path: Path, content: bytes) -> None:
 
 @contextmanager
 def log_lines(level: str, first_window: float = _FIRST_WINDOW) -> Iterator[None]:
-    """Show what tfbus logs at a level, or at a higher one, on standard error for the body of a ``with``.
+    """Show the log lines of tfbus, at a level or a higher one, on standard error for the body of a ``with``.
 
     Parameters
     ----------
@@ -317,7 +317,7 @@ class _FoldingHandler(logging.Handler):
         self._windows: dict[str, float] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Hold a line back, or count it to the one of its kind that is held back."""
+        """Hold a line back; or count it, if another line of its kind is held back."""
         kind = str(record.msg)
         if kind in self._held:
             line, more, timer = self._held[kind]

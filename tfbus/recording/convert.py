@@ -227,7 +227,7 @@ def convert(
             copy = make(part, target.name)
         except ImportError as error:
             extras = "bag,foxglove" if schema == "foxglove" else "bag"
-            problem = f"to write it, tfbus needs some packages more: {pip_install(extras)} ({error})"
+            problem = f"to write it, tfbus needs more packages: {pip_install(extras)} ({error})"
             raise RecordingError(problem, path=str(target), reason="missing extra") from error
         stack.callback(copy.close)
         run = _Run(copy, Edits() if edits is None else edits, topics)

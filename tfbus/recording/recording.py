@@ -461,7 +461,7 @@ def open_storage(file: Path) -> Storage:
     try:
         return _open_storage(file, folders=True)
     except ImportError as error:
-        problem = f"to read it, tfbus needs some packages more: {pip_install('bag')} ({error})"
+        problem = f"to read it, tfbus needs more packages: {pip_install('bag')} ({error})"
         raise RecordingError(problem, path=str(file), reason="missing extra") from error
     except FileNotFoundError as error:
         raise MissingRecordingError(path=str(file)) from error

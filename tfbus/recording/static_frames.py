@@ -120,7 +120,7 @@ def _parse(text: str) -> Any:
     try:
         from ruamel.yaml import YAML
     except ImportError as error:
-        raise ImportError(f"to read YAML, tfbus needs a package more: {pip_install('bag')}") from error
+        raise ImportError(f"to read YAML, tfbus needs one more package: {pip_install('bag')}") from error
     try:
         return YAML(typ="safe", pure=True).load(text)
     # For damaged text, a parser of YAML raises more than its own errors; deep nesting is a `RecursionError`.

@@ -35,9 +35,9 @@ from tfbus.tree.rendering import Branch, branches
 
 AUTHORITY = "robot"
 _ALIKE = 0.7
-"""The least ratio of equal letters in a misspelt name and the one that was meant."""
+"""The least ratio of equal letters in a misspelt name and a suggested one."""
 _LEAST_POSITION = 16
-"""The shortest that a position is made for the frames to have room, in columns."""
+"""The least width, in columns, to which a position is shortened to make room for the frames."""
 _COLUMNS = (Column("frame"), Column("joint", importance=2), Column("type", importance=1), Column("position"))
 
 
@@ -53,9 +53,8 @@ def robot(
 ) -> None:
     """Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at zero.
 
-    Fixed joints are published once, the others again and again. A frame that is refused, because an edge of another
-    program is in its way, is tried again. A position beyond the limits of its joint is reported and
-    published all the same.
+    Fixed joints are published once, the others again and again. If a frame is refused, because it conflicts with an
+    edge of another program, it is tried again. A position beyond the limits of its joint is reported, but published.
 
     Example: tfbus robot arm.urdf shoulder=0.5 elbow=-1.2 --tree
 
@@ -121,7 +120,7 @@ async def _follow(bus: Bus, link: LinkOptions, model: RobotModel | None, prefix:
     say(f"publishing the frames of {model.name!r} as /joint_states of {link.place} says, until Ctrl-C")
     async with AsyncExitStack() as stack:
         for place in link.ros:
-            # A link for the positions only: the frames pass by the others.
+            # This link carries the positions only; other links carry the frames.
             positions_only = ros_link(bus, place, send=False, frames=(), joint_states=publisher.publish)
             await stack.enter_async_context(positions_only)
         await anyio.sleep_forever()

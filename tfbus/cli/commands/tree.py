@@ -110,7 +110,7 @@ def tree(
 
 
 async def _listen_for_a_period(bus: Bus, tree: TransformTree) -> None:
-    """Wait until each moving frame has been heard twice and all frames are connected, or that takes too long."""
+    """Wait until each moving frame has been heard twice and all frames are connected, or until the time is up."""
     await bus.clock.sleep(_LEAST_DURATION)
     with bus.clock.move_on_after(_LONGEST_DURATION - _LEAST_DURATION):
         while remarks(tree.edges()):
@@ -126,7 +126,7 @@ def remarks(edges: Sequence[Edge]) -> list[str]:
     children = {edge.child for edge in edges}
     roots = sorted({edge.parent for edge in edges} - children)
     if len(roots) > 1:
-        lines.append(f"{len(roots):,} trees, below {_names(roots)}: what connects them was not sent meanwhile")
+        lines.append(f"{len(roots):,} trees, below {_names(roots)}: no edge between them was sent meanwhile")
     return lines
 
 

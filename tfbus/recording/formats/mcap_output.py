@@ -146,7 +146,7 @@ class McapOutput:
         try:
             from mcap.writer import Writer
         except ImportError:
-            raise ImportError(f"to record needs a package more: {pip_install('bag')}") from None
+            raise ImportError(f"recording needs one more package: {pip_install('bag')}") from None
         self.samples = 0
         self.messages = 0
         self.buffered = 0

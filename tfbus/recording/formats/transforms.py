@@ -239,7 +239,7 @@ def _protobuf_parser(channel: Channel, single: bool) -> Callable[[bytes], list[R
             ]
         except ImportError as error:
             raise MalformedMessageError(
-                "missing extra", f"to read it, tfbus needs a package more: {pip_install('foxglove')} ({error})"
+                "missing extra", f"to read it, tfbus needs one more package: {pip_install('foxglove')} ({error})"
             ) from None
         # The schema is in the file: a damaged one raises anything.
         except Exception as error:  # noqa: BLE001
