@@ -7,11 +7,11 @@ from typing import Final
 import anyio.lowlevel
 
 TURN: Final = 0.001
-"""s; two such pieces of work, each late by one message, stay within 5 ms."""
+"""In s: two such pieces of work, each late by one message, stay within 5 ms."""
 
 
 class TurnBudget:
-    """Tells work that others feed, such as the messages of a network, when other tasks have to get their turn.
+    """Tells long work, such as reading messages of a network, when other tasks have to get their turn.
 
     Parameters
     ----------

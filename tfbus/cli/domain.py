@@ -113,7 +113,7 @@ class LinkOptions:
 
     @property
     def way(self) -> str:
-        """How other programs are reached, in words."""
+        """The route to other programs, in words."""
         if self.ros:
             return f"in {self.place}"
         if self.listen:
