@@ -2498,7 +2498,7 @@ static PyMethodDef judge_methods[] = {
 
 static PyMemberDef judge_members[] = {
     {"behind", T_LONGLONG, offsetof(Judge, behind), 0, PyDoc_STR("How many stamps were older than the first bound.")},
-    {"earliest", T_LONGLONG, offsetof(Judge, earliest), 0, PyDoc_STR("The oldest accepted stamp (ns) but for late edges.")},
+    {"earliest", T_LONGLONG, offsetof(Judge, earliest), 0, PyDoc_STR("The oldest accepted stamp but of late edges.")},
     {"horizon", T_LONGLONG, offsetof(Judge, horizon), 0, PyDoc_STR("The newest accepted stamp in ns.")},
     {NULL}
 };
@@ -2588,7 +2588,7 @@ line_has_places_only(const Line *self)
 }
 
 static PyMemberDef line_members[] = {
-    {"places", T_OBJECT_EX, offsetof(Line, places), READONLY, PyDoc_STR("The lookups that need a stamp, next due last.")},
+    {"places", T_OBJECT_EX, offsetof(Line, places), READONLY, PyDoc_STR("Lookups that need a stamp, the next due last.")},
     {"for_any", T_OBJECT_EX, offsetof(Line, for_any), READONLY, PyDoc_STR("The lookups that any sample wakes.")},
     {"limits", T_OBJECT_EX, offsetof(Line, limits), READONLY, PyDoc_STR("The lookups that a newer stamp wakes.")},
     {NULL}
