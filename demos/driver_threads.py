@@ -1,8 +1,8 @@
 """Two drivers, each in a thread of its own, publish on a bus that lives in an event loop.
 
-A driver that blocks, such as one that reads a serial port, has a thread. It hands its samples over through
-`bus.threadsafe()`; the event loop publishes them, and a task reads them from a stream. What happens if a thread calls
-`bus.publish` itself is shown first.
+A driver that blocks, for example on a serial port, has a thread. It hands its samples over through `bus.threadsafe()`;
+the event loop publishes them, and a task reads them from a stream. At first, a thread calls `bus.publish` itself, to
+show the error.
 
 Run it with `python demos/driver_threads.py`; it takes a quarter of a second.
 """

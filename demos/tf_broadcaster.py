@@ -1,8 +1,8 @@
-"""The first of the tutorial's two programs: it says 100 times a second where the robot's laser is.
+"""The first of the tutorial's two programs: it publishes the pose of the robot's laser 100 times a second.
 
-Run it with `python demos/tf_broadcaster.py`, and `python demos/tf_listener.py` in another terminal, in whatever order.
-Kill either and start it again: the other one goes on by itself. Ctrl-C ends it. Programs on this machine find each
-other; a name as argument is a domain of its own. `tfbus broadcast` does the same with options.
+Run it with `python demos/tf_broadcaster.py`, and `python demos/tf_listener.py` in another terminal, in any order. Kill
+either program and start it again: the other one goes on by itself. Ctrl-C ends it. Programs on this machine find each
+other; an argument names another domain. `tfbus broadcast` does the same with options.
 """
 
 import sys

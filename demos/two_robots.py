@@ -1,9 +1,10 @@
 """Two robots with the same frame names share one bus, and one sees the other through the map.
 
-Robot 1 drives round a circle of 2 m in the map, robot 2 twice as fast round one of 3 m. Each publishes under its own
-prefix what it calls `base_link`, `camera` and `gripper`; the map is the same for both. So a robot asks about itself in
-its own names, and whoever listens without a prefix can ask across: where is robot 2's gripper, seen from robot 1's
-camera? Neither robot may end because of what the other publishes, so each leaves out what the bus refuses.
+Robot 1 drives round a circle of 2 m in the map, robot 2 twice as fast round a circle of 3 m. Each robot publishes its
+frames `base_link`, `camera` and `gripper` under its own prefix; the map is the same for both. So a robot asks about
+itself in its own names, and a buffer without a prefix can ask about both: where is robot 2's gripper, seen from robot
+1's camera? Neither robot may end because of samples of the other, so each leaves out its own samples that the bus
+refuses.
 
 Run it with `python demos/two_robots.py`.
 """

@@ -78,7 +78,7 @@ myst_heading_anchors = 3
 
 autodoc_default_options = {
     "members": True,
-    # What Python's own classes have is not told again.
+    # Members of Python's own classes are not documented again.
     "inherited-members": "BaseException, Enum, tuple, object",
     # The parts of a link call these.
     "exclude-members": "receive, send_soon, stir, serve, lookups",
