@@ -32,7 +32,7 @@ async def run_drivers(bus: tfbus.Bus) -> None:
         async with anyio.create_task_group() as drivers:
             drivers.start_soon(anyio.to_thread.run_sync, partial(drive, publish, "left_wheel", 1.0))
             drivers.start_soon(anyio.to_thread.run_sync, partial(drive, publish, "right_wheel", -1.0))
-    # The end of the `with` has published what was still pending; now the stream can end.
+    # The end of the `with` has published the pending samples; now the stream can end.
     bus.close()
 
 

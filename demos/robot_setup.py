@@ -12,7 +12,7 @@ import tfbus
 
 
 async def broadcast(bus: tfbus.Bus) -> None:
-    # The loop goes on whatever edges others publish: what the bus refuses is left out, counted, and logged once.
+    # No edge of another program may end the loop: refused samples are left out, counted, and logged once.
     broadcaster = tfbus.TransformBroadcaster(bus, authority="robot_tf_publisher", invalid="drop")
     base_from_laser = tfbus.Transform(translation=(0.1, 0.0, 0.2))
     async for _ in bus.clock.ticks(100.0):

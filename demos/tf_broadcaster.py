@@ -14,7 +14,7 @@ import tfbus
 
 async def main(domain: str) -> None:
     with tfbus.Bus() as bus:
-        # On a shared domain, an edge of another program must not end this one: what the bus refuses is left out.
+        # On a shared domain, an edge of another program must not end this one: refused samples are left out.
         broadcaster = tfbus.TransformBroadcaster(bus, authority="robot_tf_publisher", invalid="drop")
         # The laser is mounted 0.1 m forward of the robot's base, and 0.2 m above it.
         base_from_laser = tfbus.Transform(translation=(0.1, 0.0, 0.2))

@@ -19,7 +19,7 @@ SHARED = {"map"}
 
 
 async def drive(bus: tfbus.Bus, name: str, radius: float, speed: float, start: int) -> None:
-    """Publish the frames of a robot that goes round the map's origin, at so many rad/s, and looks where it goes."""
+    """Publish the frames of a robot that goes round the map's origin, at `speed` rad/s, and looks ahead."""
     robot = tfbus.TransformBroadcaster(bus, authority=name, prefix=f"{name}/", shared=SHARED, invalid="drop")
     robot.send_static("base_link", "camera", tfbus.Transform(translation=(0.2, 0.0, 1.0)))
     robot.send_static("base_link", "gripper", tfbus.Transform(translation=(0.5, 0.0, 0.4)))

@@ -50,7 +50,7 @@ static const double identity[WIDTH] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0};
 
 /* References ------------------------------------------------------------------------------------------------------- */
 
-/* What the garbage collector needs of a type whose first fields are references: `fields` of them. */
+/* The functions for the garbage collector of a type whose first fields are references: `fields` of them. */
 #define REFERENCES(name, fields)                                                                        \
     static int name##_traverse(PyObject *self, visitproc visit, void *arg)                              \
     {                                                                                                   \
@@ -496,7 +496,7 @@ static PyType_Spec block_spec = {
 
 typedef struct {
     PyObject_HEAD
-    PyObject *parent, *authority; /* plain str: those of the newest sample */
+    PyObject *parent, *authority; /* plain str, of the newest sample */
     Block *block;                 /* NULL until there is a sample */
     Py_ssize_t start, end;        /* the samples in the window */
     int64_t keep;                 /* ns; -1 for ever */
@@ -1084,7 +1084,7 @@ typedef struct {
 /* The two samples round a stamp. */
 typedef struct {
     int64_t before, after;
-    const double *a, *b; /* their rows; `a` is NULL if the stamp is that of `b` */
+    const double *a, *b; /* their rows; `a` is NULL if `b` has the stamp */
 } Segment;
 
 /* The rotation from one sample to the next: tfbus.rows.interpolate up to the fraction. */
@@ -1390,7 +1390,7 @@ chain_latest(Chain *self, PyObject *Py_UNUSED(ignored))
 typedef struct {
     Samples samples;
     Segment last; /* the segment that was used last, which holds for all stamps between its two; none if equal */
-    Turn turn;    /* that of `last` */
+    Turn turn;    /* the turn of `last` */
     Block *block; /* which it reads, or NULL */
 } Seen;
 
@@ -2241,7 +2241,7 @@ method_bind(PyObject *self, PyObject *instance, PyObject *Py_UNUSED(owner))
     return PyObject_CallFunctionObjArgs(bound_method, self, instance, NULL);
 }
 
-/* Attributes are those of the method in Python, so that its signature and its documentation are found. */
+/* Attributes come from the method in Python, so that its signature and its documentation are found. */
 static PyObject *
 method_attribute(Method *self, PyObject *name)
 {
@@ -2726,7 +2726,7 @@ feed_pop(PyObject *lines, PyObject *child, Line *line, Py_ssize_t last)
 {
     PyObject *item = PyTuple_GetItem(PyList_GetItem(line->places, last), 2);
     if (!PyObject_TypeCheck(item, ParkedType)) {
-        PyErr_SetString(PyExc_TypeError, "only what is parked has a place");
+        PyErr_SetString(PyExc_TypeError, "only a parked lookup has a place");
         return NULL;
     }
     Py_INCREF(item);

@@ -251,7 +251,7 @@ class SimulatedClock:
         """Call `callback` once, after a simulated duration in s, unless the registration is closed before.
 
         The timeouts of waiting lookups are such calls. `advance` makes the call between two runs of the tasks; it
-        raises what the call raises.
+        raises the errors of the call.
         """
         duration = as_duration(seconds, "seconds")
         if duration * SECOND >= STAMP_MAX:

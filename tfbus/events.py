@@ -368,7 +368,7 @@ class PeerRejected(PlainData):
     error: TransformError | Exception = field(compare=False)
 
     def __str__(self) -> str:
-        return _line(self.stamp, f"peer {self.peer} on {self.link} sent what was refused: {self.error}")
+        return _line(self.stamp, f"peer {self.peer} on {self.link} sent data that were refused: {self.error}")
 
 
 @dataclass(frozen=True, slots=True)

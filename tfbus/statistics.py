@@ -194,7 +194,7 @@ class RecorderStatistics(PlainData):
         Samples that a ROS message cannot hold, by reason.
     queue : QueueStatistics
         The samples that wait for the disk. Dropped samples were lost because the disk was too slow or failed; a
-        conflated sample is a static one that a newer one of the same child replaced in a full queue.
+        conflated sample is a static one that a newer sample of the same child replaced in a full queue.
     """
 
     samples: int

@@ -8,7 +8,7 @@ two empty names::
    16  child_frame_id     string
    24  transform          float64 translation x, y, z, rotation x, y, z, w
 
-The encoding is plain CDR, version 1: a header of four bytes, of which the second is the byte order and the last two are
+The encoding is plain CDR, version 1: a header of four bytes, whose second is the byte order and whose last two are
 options (OMG DDSI-RTPS 2.5, section 10); then each number at a multiple of its own size, counted from the end of the
 header, and each string with a length that counts its NUL (OMG DDS-XTYPES 1.3, section 7.4.1). Because float64 comes
 last, every transform ends at a multiple of 8.

@@ -90,7 +90,7 @@ python_use_unqualified_type_names = True
 numpydoc_show_class_members = False
 default_role = "py:obj"
 
-# The import paths of which the reference tells, the preferred one first. Modules may move below them.
+# The import paths in the reference, the preferred one first. Modules may move below them.
 PATHS = (
     "tfbus",
     "tfbus.links",
@@ -154,10 +154,10 @@ WORDS = frozenset(words())
 
 
 def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: TextElement) -> Element | None:
-    """The targets that the reference has under another name, or not at all.
+    """The target of a name that the reference has under another name, or not at all.
 
     Annotations have names from inner modules, such as ``tfbus.stamps.Latest``: they are found by identity. Docstrings
-    of one import path name what is in another, such as `SimulatedClock` in ``tfbus.testing``. Arguments and attributes
+    of one import path use names of another, such as `SimulatedClock` in ``tfbus.testing``. Arguments and attributes
     are code and link to nothing.
     """
     if node.get("refdomain") != "py":

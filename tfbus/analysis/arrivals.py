@@ -51,7 +51,7 @@ class Arrival:
     Attributes
     ----------
     frame, parent, authority : str
-        The parent is that of the newest sample.
+        The parent is from the newest sample.
     static : bool
         Whether the newest sample is static; such a frame is not measured.
     samples : int

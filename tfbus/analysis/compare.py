@@ -63,7 +63,7 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Statistics of errors, in m or rad; the standard deviation is that of the population."""
+    """Statistics of errors, in m or rad; `std` is the standard deviation of the population."""
 
     rmse: float
     mean: float

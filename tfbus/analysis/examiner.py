@@ -20,9 +20,9 @@ from tfbus.tree.tree import TransformTree, forest_of
 ADVICE = {
     "translation": "no robot is there: look for an uninitialised or diverged estimate at its sender",
     "jump": "the sender has reset, or mixes two estimates: look at it, or leave these out with max_speed=",
-    "turn": "the sender has reset, or two estimates disagree: look at what it does then",
+    "turn": "the sender has reset, or two estimates disagree: look at its state then",
     "stamps go back": "messages overtake each other, or a clock was set back: use one sender, and one clock",
-    "ahead": "the clock of the sender is ahead of that of the recorder: synchronise them",
+    "ahead": "the clock of the sender is ahead of the recorder's clock: synchronise them",
     "duplicate stamps": "the last one wins: give each transform a stamp of its own, or send it once",
     "gap": "lookups interpolate across it: look for what stopped the sender, or refuse with max_gap=",
     "rate": "the sender is overloaded, or messages are lost on the way",
@@ -323,7 +323,7 @@ class Examiner:
             self._uneven[frame] = count + 1, first, max(worst, off)
 
     def findings(self) -> list[Finding]:
-        """All faults: first the faults of the whole tree, then those of each frame."""
+        """All faults: first the faults of the whole tree, then the faults of each frame."""
         found = list(self._of_the_tree())
         for name in sorted(self._frames):
             found += self._frames[name].findings(self._limits)

@@ -229,7 +229,7 @@ class Buffer:
         ClockResetError
             If the clock jumped back meanwhile.
         UnknownFrameError
-            At once, if a name cannot be that of a frame: empty, or with a leading slash.
+            At once, if a name cannot be the name of a frame: empty, or with a leading slash.
         TypeError
             If a stamp is a float, or `max_age` comes without a `LATEST`.
         """
@@ -280,7 +280,7 @@ class Buffer:
         Returns
         -------
         same type as `data`
-            Its frame is `target`, its stamp that of the transform.
+            Its frame is `target`, and its stamp is the stamp of the transform.
 
         Raises
         ------
@@ -382,10 +382,10 @@ class Buffer:
         ----------
         target, source : str
         min_translation : float
-            Give an answer when source has moved by so many m.
+            In m. Give an answer when source has moved by this much.
         min_rotation : float
-            Give an answer when source has turned by so many rad. With both thresholds, one is enough; without any, the
-            watch gives every answer with another stamp or value.
+            In rad. Give an answer when source has turned by this much. With both thresholds, one is enough; without
+            any, the watch gives every answer with another stamp or value.
         max_rate : float, optional
             Give at most this many answers per s on the bus's clock. Only the last answer, after the end, may come
             sooner.
@@ -404,7 +404,7 @@ class Buffer:
         Raises
         ------
         UnknownFrameError
-            If a name cannot be that of a frame: empty, or with a leading slash.
+            If a name cannot be the name of a frame: empty, or with a leading slash.
         TypeError, ValueError
             If a threshold is negative or an angle of more than pi, a rate is not greater than zero, or something is not
             a number.

@@ -227,7 +227,7 @@ class Alarms(Protocol):
 
 
 def alarms_of(clock: Clock) -> Alarms | None:
-    """Alarms by the clock of a bus; None for a clock of another class than those of tfbus."""
+    """Alarms by the clock of a bus; None for a clock that is not a class of tfbus."""
     # Not isinstance: a class derived from a clock may tell the time in another way.
     if type(clock) is SystemClock:
         return LoopAlarms()
@@ -422,7 +422,7 @@ class Lookups:
     ----------
     live : LiveTree
     bus : Bus
-        Its clock is that of timeouts and ages; it says which thread may wait here.
+        Its clock measures timeouts and ages; it says which thread may wait here.
     local_names : LocalNames, optional
         Translates the answers. Questions, errors and log lines have the names of the bus.
     """
@@ -483,7 +483,7 @@ class Lookups:
     async def lookup(
         self, question: Question, timeout: float | None, others: tuple[Question, ...] = ()
     ) -> TransformStamped:
-        """The answer as soon as there is one, after a checkpoint; the errors are those of `Buffer.lookup`.
+        """The answer as soon as there is one, after a checkpoint; the errors are as in `Buffer.lookup`.
 
         `others` are further questions that need an answer: if waiting cannot help one of them, its error is raised.
         """
@@ -548,7 +548,7 @@ class Lookups:
             wait.cancel_reminder = alarms.call_after(REPORT_AFTER, partial(self._remind, wait, alarms))
 
     def _park(self, wait: "_Wait") -> Waiter:
-        """Park a lookup under what it lacks, with a new wake-up."""
+        """Park a lookup under the frames that block it, with a new wake-up."""
         live = self.live
         if live.end_reason is not None:
             raise BusClosedError(live.end_reason) from wait.blocker
@@ -605,7 +605,7 @@ class Lookups:
         return self.lookup_nowait(question)
 
     def _check_names(self, question: Question) -> None:
-        """Raise `UnknownFrameError` for a name that can never be that of a frame."""
+        """Raise `UnknownFrameError` for a name that can never be the name of a frame."""
         for name in (question.target, question.source, question.fixed):
             if name is not None and not is_frame(name):
                 raise UnknownFrameError(frame=name, known=self.live.forest.some_frames()) from None

@@ -139,7 +139,7 @@ class Watch:
         return answer
 
     def _is_change(self, answer: TransformStamped) -> bool:
-        """Whether an answer differs enough from the last one that was yielded."""
+        """Whether an answer differs enough from the last one."""
         last = self._last
         if last is None:
             return True

@@ -404,7 +404,7 @@ class Bus:
         Raises
         ------
         InvalidTransformError
-            If another authority has reserved it, or the name cannot be that of a frame.
+            If another authority has reserved it, or the name cannot be the name of a frame.
         BusClosedError
         """
         self._check_usable()

@@ -219,7 +219,7 @@ class Staleness:
     def due(self) -> int | None:
         """The first stamp, in ns, at which `changes` may have something new if no sample arrives; None if never.
 
-        Call `changes` first: it looks at what was noted.
+        Call `changes` first, which works on the noted frames.
         """
         while self._due and self._due[0] not in self._due_at:
             heappop(self._due)

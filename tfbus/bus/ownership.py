@@ -96,7 +96,7 @@ class Ownership:
         Raises
         ------
         InvalidTransformError
-            If the name cannot be that of a frame, or another authority has reserved it (``reason="reserved"``).
+            If the name cannot be the name of a frame, or another authority has reserved it (``reason="reserved"``).
         TypeError
             If `authority` is not a string.
         """

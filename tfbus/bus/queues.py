@@ -117,7 +117,7 @@ class SampleQueue:
         self._keep_only(lambda sample: sample.static)
 
     def statistics(self, kind: str) -> QueueStatistics:
-        """The queue's counters; `kind` says what it is for."""
+        """The queue's counters; `kind` is its purpose."""
         return QueueStatistics(kind, self.overflow, self.capacity, len(self), self.dropped, self.conflated)
 
     def _conflate(self, sample: TransformStamped) -> None:
@@ -157,7 +157,7 @@ class SampleQueue:
         return published, batch
 
     def _keep_static(self, published: int, sample: TransformStamped) -> None:
-        # Behind the others, so that the order is that of publication.
+        # Behind the others, to keep the order of publication.
         self._kept.pop(sample.child, None)
         self._kept[sample.child] = published, sample
 

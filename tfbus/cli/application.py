@@ -22,7 +22,7 @@ COMMANDS = {
     "bridge": "Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.",
     "broadcast": "Broadcast the transform of the tutorial's laser, until Ctrl-C; tfbus listen in another terminal "
     "receives it.",
-    "check": "Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.",
+    "check": "Find faults in a recording, or in a domain for some time: which, when, how often, and what to do.",
     "compare": "Compare the trajectory of a frame in two recordings: absolute and relative pose error, aligned and "
     "not.",
     "convert": "Write recordings to a new one: in another format, a part of them, renamed, or several merged by their "
@@ -145,7 +145,7 @@ def _panel(title: str, rows: Mapping[str, str], width: int) -> str:
 
 
 def application(command: str | None) -> Any:
-    """The command line with all its subcommands, none of which is loaded before it is parsed.
+    """The command line with all its subcommands; a subcommand is loaded only when it is parsed.
 
     Parameters
     ----------

@@ -186,7 +186,7 @@ class LinkOptions:
             yield [link]
 
     def run_remote(self, program: Callable[[RemoteLookups], Awaitable[T]]) -> T:
-        """Run a program that asks the buffer of another program, that of the robot in `robots`, until its end.
+        """Run a program that asks the buffer of the robot in `robots`, in another process, until its end.
 
         Raises
         ------
@@ -296,8 +296,8 @@ def run(main: Callable[[], Awaitable[T]], backend: str) -> T:
 class ReplayClock(SystemClock):
     """The machine's time until the first stamp of a replay arrives, and then the newest stamp that has arrived.
 
-    So ages are counted in the time of the replay. Durations, rates and timeouts stay those of the machine: a command
-    goes on while the replay is paused.
+    So ages are counted in the time of the replay. Durations, rates and timeouts use the machine's time: a command goes
+    on while the replay is paused.
     """
 
     def __init__(self) -> None:
@@ -390,7 +390,7 @@ def ros_link(bus: Bus, place: str, **options: Any) -> Link:
 async def publish_static(
     bus: Bus, samples: Sequence[TransformStamped], *, task_status: TaskStatus[None] = anyio.TASK_STATUS_IGNORED
 ) -> None:
-    """Publish static samples; one that the bus refuses is shown once, and tried again until it is accepted.
+    """Publish static samples; a refused sample is shown once, and tried again until it is accepted.
 
     A refused sample may close a loop with an edge of another program, and that program may end. As a task, it has
     started once each sample has been tried.

@@ -307,7 +307,7 @@ class _FoldingHandler(logging.Handler):
     """Prints the first line of a kind with the number of lines that follow within a short time.
 
     Lines are of one kind if they differ only in their arguments. The time doubles each time that a kind comes again, up
-    to `_LONGEST_WINDOW`, and nothing is lost: `close` prints what is still held back.
+    to `_LONGEST_WINDOW`, and nothing is lost: `close` prints all lines that are still held back.
     """
 
     def __init__(self, first_window: float) -> None:

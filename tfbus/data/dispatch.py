@@ -162,9 +162,9 @@ def moved_header(data: Stamped, transform: TransformStamped) -> tuple[str, int]:
 def construct(data: Any, *values: object) -> None:
     """Set the fields of a frozen dataclass and check them, as its own ``__init__`` does.
 
-    A class writes its ``__init__`` for the types of its arguments, which are wider than those of its fields.
+    A class writes its ``__init__`` for the types of its arguments, which are wider than the types of its fields.
     """
-    # The fields of a subclass begin with those of its base.
+    # The fields of a subclass begin with the fields of its base.
     for name, value in zip(data.__match_args__, values, strict=False):
         object.__setattr__(data, name, value)
     data.__post_init__()

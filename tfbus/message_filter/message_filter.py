@@ -154,7 +154,7 @@ class MessageQueue(Generic[MessageT, AnswerT]):
         self.unanswered = 0
         self._arrivals = count()
         self._pending: dict[int, PendingMessage[MessageT, AnswerT]] = {}
-        # The places in the order of delivery; with "ready", only those of answered messages.
+        # The places in the order of delivery; with "ready", only the places of answered messages.
         self._line: list[tuple[int, int]] = []
 
     def __len__(self) -> int:
@@ -277,7 +277,7 @@ class Targets(Generic[AnswerT]):
         Raises
         ------
         TransformLookupError
-            If there is none. If there are several errors, one that waiting cannot help is raised first.
+            If there is none. Among several errors, an error that waiting cannot help is raised first.
         """
         now = self._buffer.bus.clock.now() if isinstance(stamp, Latest) else stamp
         found = {frame: answer_of(frame, frame, now, IDENTITY, static=True)}
@@ -293,7 +293,7 @@ class Targets(Generic[AnswerT]):
         return cast(AnswerT, answers[0] if self._one else answers)
 
     async def wait(self, frame: str, stamp: int | Latest) -> None:
-        """Wait until each question has had an answer; the errors are those of `Buffer.lookup`."""
+        """Wait until each question has had an answer; the errors are as in `Buffer.lookup`."""
         await self._buffer._lookup_among([Question(target, frame, at) for target, at in self.questions(frame, stamp)])
 
     def blocker(self, frame: str, stamp: int | Latest) -> TransformLookupError | None:

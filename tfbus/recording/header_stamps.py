@@ -74,7 +74,7 @@ def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
 
 
 def begins_with_header(channel: Channel) -> bool:
-    """Whether the messages of a channel of ROS begin with a header, by the definition in the file or that of ROS 2."""
+    """Whether the messages of a channel of ROS begin with a header, by the definition in the file, or in ROS 2."""
     if channel.encoding not in ("cdr", "ros1"):
         return False
     if channel.schema and channel.schema_encoding in ("ros1msg", "ros2msg"):

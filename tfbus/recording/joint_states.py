@@ -42,7 +42,7 @@ def load_joint_states(
         A prefix for the names of all frames.
     problems : Counter, optional
         Gets the number of positions and messages that were left out: ``"unknown joint"``, the reasons of
-        `InvalidTransformError`, and those of damage.
+        `InvalidTransformError`, and the reasons of damage.
 
     Returns
     -------

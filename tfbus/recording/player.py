@@ -111,7 +111,7 @@ class Player:
     for samples that are not recorded.
 
     On a bus with a `SimulatedClock` the player drives that clock: the clock jumps to the beginning of the recording and
-    then advances from the log time of one message to that of the next, so timed tasks run as they did during the
+    then advances from the log time of one message to the next log time, so timed tasks run as they did during the
     recording, at any rate. No other task may advance the clock meanwhile. Beginning again and seeking back are jumps
     back of the clock.
 

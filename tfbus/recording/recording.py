@@ -3,7 +3,7 @@
 The first bytes of a file choose a `Storage` in `tfbus.recording.formats`, which gives the payloads of messages by log
 time. `Selection` chooses the channels. Then two ways lead from bytes to samples, and both give the same bits:
 
-* `Recording.messages` decodes one message after the other (`ChannelDecoder`), and tells what is wrong with each.
+* `Recording.messages` decodes one message after the other (`ChannelDecoder`), with an error for each bad transform.
 * `Recording.blocks` gives many messages at once. `Block.columns` decodes all of them with numpy (`ColumnDecoder`), if
   nothing in the block has to be judged; otherwise `Block.messages` decodes them one by one.
 
@@ -331,7 +331,7 @@ class Recording:
         latched: dict[str, TransformStamped] = {}
         for stored in storage.messages(self._is_static, None, since - 1):
             for sample in self._message(stored).batch:
-                # The order is that of the newest samples.
+                # In the order of the newest samples.
                 latched.pop(sample.child, None)
                 latched[sample.child] = sample
         for sample in latched.values():

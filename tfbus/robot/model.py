@@ -297,7 +297,7 @@ class Described(NamedTuple):
 
 
 def read_urdf(source: str | os.PathLike[str]) -> Urdf:
-    """Read the links and joints of a URDF; the source and the errors are those of `read_elements`."""
+    """Read the links and joints of a URDF; the source and the errors are as in `read_elements`."""
     name, elements = read_elements(source)
     links = tuple(each.value.name for each in elements if each.tag == "link")
     return Urdf(name, links, tuple(_joint(each.value, each.label) for each in elements if each.tag == "joint"))
@@ -792,7 +792,7 @@ class RobotModel:
         return found
 
     def unknown_joints(self, names: Iterable[str]) -> list[str]:
-        """The names of which the robot has no joint."""
+        """The names that are not names of joints."""
         return [name for name in names if name not in self._names]
 
     def zeros(self) -> dict[str, Position]:

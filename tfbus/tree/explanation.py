@@ -81,7 +81,7 @@ class Explanation(PlainData):
     edges : tuple of ExplainedEdge
         One for each two neighbours in the chain, in its order; or in the two half chains, target's first.
     errors : tuple of TransformLookupError
-        All errors that block the answer, among them the one that a lookup raises.
+        All errors that block the answer, among them the error that a lookup raises.
     """
 
     target: str

@@ -298,7 +298,7 @@ class FrameHistory(History):
             self.changed = True
 
     def parent_at(self, stamp: int) -> str:
-        """The parent that holds at `stamp`; outside the window, that of the nearest sample."""
+        """The parent that holds at `stamp`; outside of the window, the parent of the nearest sample."""
         return self._parents.at(stamp) if self.mixed else self.parent
 
     def covers(self, stamp: int) -> bool:
@@ -360,7 +360,7 @@ class FrameHistory(History):
         return self.static or (oldest is not None and oldest <= stamp)
 
     def around(self, stamp: int) -> tuple[int | None, int | None]:
-        """The stamp of the last sample not after `stamp`, and that of the next one, in ns."""
+        """The stamps of the last sample not after `stamp`, and of the next sample, in ns."""
         i, count = self.find(stamp), self.count
         if i < count and self.stamp(i) == stamp:
             i += 1
@@ -468,7 +468,7 @@ class EdgeState(Enum):
 
 
 def state_of(edge: Edge, now: int, stale_after: float = STALE_AFTER) -> EdgeState:
-    """The state of an edge at the stamp `now` (ns); moving edges are stale after so many s."""
+    """The state of an edge at the stamp `now` (ns); moving edges are stale after `stale_after` s."""
     if edge.static:
         return EdgeState.STATIC
     if edge.newest is None:

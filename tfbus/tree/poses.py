@@ -78,7 +78,7 @@ class PoseReader:
         self.topology: object = None
 
     def read(self, fixed: str, at: int | Latest = LATEST) -> Poses:
-        """The poses in the frame `fixed` at a stamp, or for each frame at the one that `LATEST` means.
+        """The poses in the frame `fixed` at a stamp; with `LATEST`, each frame at its own newest stamp.
 
         Raises
         ------
@@ -104,7 +104,7 @@ class PoseReader:
             return newest, [history.newest_record for history in newest.moving]
 
     def _read_any(self, fixed: str, at: int | Latest) -> Poses:
-        """The poses, whatever stamps and parents the samples have."""
+        """The poses by samples of any stamps and parents."""
         forest = self._forest
         with forest.lock:
             forest.check_known(fixed)

@@ -188,7 +188,7 @@ class TransformTree:
         Returns
         -------
         TransformStamped
-            Parent is target and child is source; its stamp is `at`, or the one that `LATEST` found. An answer whose
+            Parent is target and child is source; its stamp is `at`, or the stamp that `LATEST` found. An answer whose
             whole path is static has ``static=True`` and, for `LATEST`, the newest stamp among its samples. In time
             travel, a `LATEST` that only static edges answer takes the stamp of source. With a policy, `extrapolated_by`
             and `gap` say how far the answer departs from its stamp.
@@ -337,9 +337,9 @@ class TransformTree:
         Parameters
         ----------
         cloud : PointCloud
-            With a stamp for each point. If the stamp of the cloud is `LATEST`, that of the newest point is used.
+            With a stamp for each point. If the stamp of the cloud is `LATEST`, the stamp of the newest point is used.
         target : str
-            The frame of the result; often that of the cloud.
+            The frame of the result; often the frame of the cloud.
         fixed : str
             The frame that stands still meanwhile, such as ``"odom"``.
         out_of_range : {"raise", "nan"}

@@ -155,7 +155,7 @@ class Canvas:
             self._solids.draw(scene)
 
     def add_points(self, name: str, cloud: PointCloud, size: float, colour: Any) -> None:
-        """Add points, or replace those of the same name; they are hidden until they have a pose."""
+        """Add points, or replace the points of the same name; they are hidden until they have a pose."""
         points = cloud.points[np.isfinite(cloud.points).all(axis=1)]
         colours = np.asarray(colour)
         if colours.ndim == 2:
@@ -280,7 +280,7 @@ class Panel:
         self._status = gui.add_html("")
         self._fixed = gui.add_dropdown("Fixed frame", (LARGEST,), hint="The frame that stands still")
         self._search = gui.add_text("Search", "", hint="Part of the name of a frame")
-        self._frame = gui.add_dropdown("Frame", (NONE,), hint="The selected frame; those that match the search")
+        self._frame = gui.add_dropdown("Frame", (NONE,), hint="The selected frame, or one that matches the search")
         with gui.add_folder("Selected frame"):
             self._selection = gui.add_html("")
             trail = gui.add_button("Trail on or off", hint="Draw where this frame was in the last ten seconds")

@@ -595,7 +595,7 @@ class LiveTree:
             try:
                 callback()
             except Exception as error:
-                logging.getLogger("tfbus").warning("what was to be called at the end raised", exc_info=error)
+                logging.getLogger("tfbus").warning("a callback at the end of a buffer raised", exc_info=error)
 
     def on_end(self, callback: Callable[[], object]) -> Registration:
         """Register a function for `call_end_callbacks`, or call it now if the end has come."""

@@ -114,7 +114,7 @@ def _print_summary(player: Player, bus: Bus, seconds: float) -> None:
 class Keyboard:
     """The keys that are pressed, for the body of a ``with``: ``async for key in keyboard.keys()``.
 
-    A key is its letter, or ``"up"``, ``"down"``, ``"left"``, ``"right"``. Ctrl-C and Ctrl-Z do what they always do.
+    A key is its letter, or ``"up"``, ``"down"``, ``"left"``, ``"right"``. Ctrl-C and Ctrl-Z work as usual.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ def robot(
     Parameters
     ----------
     file
-        A URDF. Without one, --follow takes that of /robot_description of ROS.
+        A URDF. Without one, --follow takes the URDF from /robot_description of ROS.
     position
         As NAME=NUMBER, the position of a joint in rad or m; for a planar joint x,y,angle, for a floating one
         x,y,z,qx,qy,qz,qw.
@@ -75,7 +75,7 @@ def robot(
         A prefix for the names of all frames, such as robot1/.
     """
     if file is None and not (follow and link.ros):
-        raise UsageError("give a URDF, or take that of ROS with --follow and --ros")
+        raise UsageError("give a URDF, or take the URDF of ROS with --follow and --ros")
     if file is not None and "=" in file.name and not file.exists():
         raise UsageError(f"the URDF comes first: tfbus robot FILE {file}")
     if follow and not link.ros:
@@ -183,7 +183,7 @@ def tree_lines(
 
 
 def _layout(rows: Sequence[tuple[str, str, str, str, str]], width: int | None) -> tuple[int, int]:
-    """The width of a level, and that of the positions, which are shortened first where the frames would not fit."""
+    """The widths of a level and of the positions; if the frames do not fit, the positions are shortened first."""
     positions = max(cells(row[4]) for row in rows)
     least = min(_LEAST_POSITION, positions)
     for step in (4, 2, 1):

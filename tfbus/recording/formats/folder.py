@@ -149,7 +149,7 @@ class SqliteStorage:
         self._numbered: dict[int, Channel] = {}
         for number, name, kind, encoding, profiles in _bounded(topics):
             if not all(isinstance(text, str) for text in (name, kind, encoding)):
-                # Its messages are counted as those of a topic that is not described.
+                # Its messages are counted as messages of a topic that is not described.
                 continue
             schema_encoding, schema = definitions.get(kind, ("", b""))
             metadata = {"offered_qos_profiles": str(profiles)} if profiles else {}

@@ -82,7 +82,7 @@ class ChunkPacker:
     Parameters
     ----------
     reading : McapReading
-        Knows the wanted channels, and counts what is in the chunks.
+        Knows the wanted channels, and counts the messages in the chunks.
     """
 
     def __init__(self, reading: "McapReading") -> None:
@@ -331,7 +331,7 @@ class McapStorage:
     ----------
     path : Path
     file : file, optional
-        The open file to read; by default that of the path.
+        The open file to read; by default, the file at the path is opened.
 
     Attributes
     ----------
@@ -386,7 +386,7 @@ class McapStorage:
 
     @property
     def channels(self) -> Mapping[Channel, int | None]:
-        """All channels known so far; their counts are those of the statistics, or of a whole reading."""
+        """All channels known so far, with counts from the statistics, or from a whole reading."""
         counts = self._counted if self._statistics is None else self._statistics.channel_message_counts
         return {
             channel: None if counts is None else counts.get(number, 0) for number, channel in self._numbered.items()
@@ -457,7 +457,7 @@ class McapStorage:
             with suppress(*DAMAGE, EndOfFile):
                 self._use_index(start)
         if self._statistics is None:
-            # Descriptions of a damaged index would contradict those in the chunks.
+            # Descriptions of a damaged index would contradict the descriptions in the chunks.
             self._schemas.clear()
             self._numbered.clear()
             self._budget = DescriptionBudget()
@@ -507,7 +507,7 @@ class McapStorage:
             self._chunks = sorted(chunks)
 
     def register(self, record: records.McapRecord) -> bool:
-        """Note a schema or a channel; returns whether it agrees with what is known already."""
+        """Note a schema or a channel; returns whether it agrees with the known ones."""
         if isinstance(record, records.Schema):
             if record.id not in self._schemas:
                 self._budget.take(record.name, record.data)

@@ -118,7 +118,7 @@ class Chunk(NamedTuple):
 
     @classmethod
     def parse(cls, data: bytes, torn: bool = False) -> "Chunk":
-        """Parse the content of a chunk record; with `torn`, one that may end too early.
+        """Parse the content of a chunk record; with `torn`, the record may end too early.
 
         Raises
         ------

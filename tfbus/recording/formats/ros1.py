@@ -361,7 +361,7 @@ class Ros1Storage:
 
     @property
     def channels(self) -> Mapping[Channel, int | None]:
-        """All channels known so far; their counts are those of the index, or of a whole reading."""
+        """All channels known so far, with counts from the index, or from a whole reading."""
         counts = self._counted if self._promised is None else self._promised
         return {channel: None if counts is None else counts[number] for number, channel in self._numbered.items()}
 

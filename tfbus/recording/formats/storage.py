@@ -1,7 +1,7 @@
 """The parts that all formats share: the bounds of a hostile file, channels and messages, and their order by log time.
 
 A `Storage` is an open file. It gives `StoredMessage`, one by one, or `Packed`: many messages in one piece of memory,
-which numpy decodes without a Python object for each. Nothing here knows a format, or what a message holds.
+which numpy decodes without a Python object for each. Nothing here knows a format, or the content of a message.
 
 * Bounds. A few bytes can claim, or unfold to, more than any machine holds. A size beyond its bound is not read, and its
   place is reported. `tfbus.recording.open_recording` documents the bounds. `unfold` decompresses up to a bound.
@@ -123,7 +123,7 @@ class Channel:
 
 
 StoredMessage = tuple[int, Channel | MalformedMessageError, bytes]
-"""Log time in ns, channel and payload of a message; an error in place of the channel says what was lost there."""
+"""Log time in ns, channel and payload of a message; an error in place of the channel describes a loss there."""
 Wanted = Callable[[Channel], bool]
 """Whether the messages of a channel are read."""
 

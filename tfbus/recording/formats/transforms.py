@@ -4,8 +4,8 @@
   normalised, so a transform passes from one format to another without a change of any bit. The layout of a ROS message
   is a sequence of numbers and strings; in CDR each is aligned to its size (see `tfbus.tf_message`); in ROS 1 nothing is
   aligned, strings have no NUL, and a header begins with a sequence number.
-* `ChannelDecoder` decodes one message to samples, and tells what is wrong with each. Payloads that are not in CDR are
-  converted to it first.
+* `ChannelDecoder` decodes one message to samples, with an error for each bad transform. It converts payloads to CDR
+  first.
 * `ColumnDecoder` decodes many messages at once, with numpy. Most messages of a channel differ only in their stamps and
   numbers: the same frames are at the same bytes. So messages of one size are stacked to a matrix of bytes, and each
   transform of the message becomes two slices of it. It gives the same bits as `ChannelDecoder`. For a block with
