@@ -144,7 +144,7 @@ async def changes(request: Request) -> Response:
 
 async def poses(socket: WebSocket) -> None:
     target, source = socket.path_params["target"], socket.path_params["source"]
-    # Programs that are no browsers send no origin.
+    # Programs other than browsers send no origin.
     origin = socket.headers.get("origin")
     if origin not in (None, f"http://{socket.headers.get('host')}", *ORIGINS):
         await socket.close()

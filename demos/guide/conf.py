@@ -58,7 +58,7 @@ nitpick_ignore_regex = [
     ("py:class", r"tfbus\..*\.MalformedMessageError"),
     # The parts of a recording for code that reads it in blocks.
     ("py:class", r"tfbus\.recording\.(recording\.(Decoded)?Block|formats\.\w+\.RawTransform)"),
-    # The parts of a link, and a follower of the time that is no clock.
+    # The parts of a link, and the follower of a clock.
     ("py:class", r"tfbus\.links\.(clock_follower\.HearsTime|endpoint\.Endpoint|wire\.Wire|lookups\.Serving)"),
     ("py:class", r"tfbus\.links\.(link\.DomainOptions|ros\.\w+\.(RosCarrier|RosOptions))"),
     # Sphinx splits the parameters of such types.

@@ -148,7 +148,7 @@ def test_it_is_said_whom_a_program_hears_and_how(
                 if "1 peer" in said:
                     other.publish(static("map", "odom"))
                     await met.wait()
-                options.say_who_is_heard(links)
+                options.print_peers(links)
 
     anyio.run(meet)
     assert capsys.readouterr() == ("", f"{said}\n")

@@ -101,7 +101,7 @@ class WebDoor:
     def _judge(self, received: bytes) -> tuple[str, str]:
         headers = _headers(received)
         if headers is None:
-            return "400 Bad Request", "this is no request of HTTP"
+            return "400 Bad Request", "this is not a request of HTTP"
         hosts, origins = headers.get("host", []), headers.get("origin", [])
         if len(hosts) != 1 or len(origins) > 1:
             return "400 Bad Request", "a request has one Host, and no more than one Origin"

@@ -180,7 +180,7 @@ class MovingSamples:
         yield from self._at("translation", far, stamps, lengths, "m", f"farther than {limits.translation:g} m")
         last = np.append(stamps[1:] != stamps[:-1], True)
         yield from self._at("duplicate stamps", ~last, stamps, None, "", "stamps that came before")
-        # If samples share a stamp, the last one holds. A sample that is too far away is no jump as well.
+        # If samples share a stamp, the last one holds. A sample that is too far away does not count as a jump as well.
         good = last & ~far
         stamps, rows, parents = stamps[good], rows[good], parents[good]
         # The difference of stamps that are centuries apart does not fit 64 bits.

@@ -50,8 +50,8 @@ class LateBuffer:
             elif edge.newest is not None and history.newest is not None and history.newest > edge.newest:
                 self._foreign.add(child)
         for child, edge in topology.moving().items():
-            held = None if child not in self._frames else self._frames[child].newest
-            if edge.newest is not None and (held is None or held < edge.newest):
+            prefilled = None if child not in self._frames else self._frames[child].newest
+            if edge.newest is not None and (prefilled is None or prefilled < edge.newest):
                 self._unseen[child] = edge.parent, edge.newest
         for child in tuple(self._foreign):
             self._open_loop(child)

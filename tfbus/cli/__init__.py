@@ -15,15 +15,15 @@ def main() -> None:
     While modules are loaded, and after the command has ended, Ctrl-C has its default action, which is silent: a
     `KeyboardInterrupt` would show a traceback there.
     """
-    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
     def begin() -> None:
         gc.freeze()
         gc.enable()
-        if heard:
+        if is_default:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    if heard:
+    if is_default:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     # Modules are never garbage: a collection while they are loaded takes a sixth of the time of the help.
     gc.disable()
@@ -33,6 +33,6 @@ def main() -> None:
         status = run(sys.argv[1:], begin)
     finally:
         gc.enable()
-        if heard:
+        if is_default:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
     sys.exit(status)

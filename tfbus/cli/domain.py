@@ -112,7 +112,7 @@ class LinkOptions:
         return f"ROS at {' and '.join(self.ros)}" if self.ros else f"domain {self.domain!r}"
 
     @property
-    def way(self) -> str:
+    def route(self) -> str:
         """The route to other programs, in words."""
         if self.ros:
             return f"in {self.place}"
@@ -238,14 +238,14 @@ class LinkOptions:
                 await arrived.wait()
                 return
             say(f"waiting for transforms on {self.place} …")
-            self.say_who_is_heard(links)
+            self.print_peers(links)
             await arrived.wait()
 
-    def say_who_is_heard(self, links: Sequence[Link]) -> None:
+    def print_peers(self, links: Sequence[Link]) -> None:
         """Print how many peers the links have, and how they are reached; nothing without a link."""
         if links:
             peers = sum(len(link.peers) for link in links)
-            say(f"hears {'nobody' if not peers else '1 peer' if peers == 1 else f'{peers:,} peers'} {self.way}")
+            say(f"hears {'nobody' if not peers else '1 peer' if peers == 1 else f'{peers:,} peers'} {self.route}")
 
 
 DEFAULT_LINK = LinkOptions()
@@ -301,19 +301,19 @@ class ReplayClock(SystemClock):
     """
 
     def __init__(self) -> None:
-        self._told: int | None = None
+        self._replayed: int | None = None
         self._patient_until = time.monotonic() + _PATIENCE
-        self._heard = anyio.Event()
+        self._arrival = anyio.Event()
         self._callbacks: dict[object, JumpCallback] = {}
 
     @property
     def is_set(self) -> bool:
         """Whether a stamp has arrived, or none has for so long that the machine's time counts."""
-        return self._told is not None or time.monotonic() >= self._patient_until
+        return self._replayed is not None or time.monotonic() >= self._patient_until
 
     def now(self) -> int:
         """The newest stamp that has arrived, or the machine's time; in ns."""
-        return super().now() if self._told is None else self._told
+        return super().now() if self._replayed is None else self._replayed
 
     def hear(self, stamp: int) -> None:
         """Take the time of the replay, in ns; an earlier one is a jump back.
@@ -321,10 +321,10 @@ class ReplayClock(SystemClock):
         The first stamp is of another clock than the time before, so it is neither earlier nor later. It is announced as
         a jump to itself, and samples that arrived before it stay.
         """
-        before = stamp if self._told is None else self._told
-        first, self._told = self._told is None, stamp
-        heard, self._heard = self._heard, anyio.Event()
-        heard.set()
+        before = stamp if self._replayed is None else self._replayed
+        first, self._replayed = self._replayed is None, stamp
+        arrival, self._arrival = self._arrival, anyio.Event()
+        arrival.set()
         if first or stamp < before:
             for callback in tuple(self._callbacks.values()):
                 callback(before, stamp)
@@ -337,8 +337,8 @@ class ReplayClock(SystemClock):
             if now < before:
                 raise ClockResetError(before=before, after=now)
             before = now
-            with anyio.move_on_after((wanted - now) / SECOND if self._told is None else None):
-                await self._heard.wait()
+            with anyio.move_on_after((wanted - now) / SECOND if self._replayed is None else None):
+                await self._arrival.wait()
 
     def on_jump(self, callback: JumpCallback) -> Registration:
         """Call `callback` with the stamps before and after each jump."""
@@ -383,7 +383,7 @@ def ros_link(bus: Bus, place: str, **options: Any) -> Link:
     except (ImportError, ValueError) as error:
         raise UsageError(str(error)) from None
     raise UsageError(
-        f"{place!r} is no place of ROS: write dds, dds:42 for ROS_DOMAIN_ID 42, zenoh:host:7447, or ws://host:9090"
+        f"{place!r} is not a place of ROS: write dds, dds:42 for ROS_DOMAIN_ID 42, zenoh:host:7447, or ws://host:9090"
     )
 
 

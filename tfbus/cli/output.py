@@ -56,7 +56,7 @@ def warn(message: str) -> None:
 
 
 def terminal_width() -> int | None:
-    """The greatest length of a line on standard output; None where it is no terminal, which has room for any line.
+    """The greatest length of a line on standard output; None if it is not a terminal: then any line fits.
 
     The variable ``COLUMNS`` of the environment decides, if it is set.
     """
@@ -313,26 +313,26 @@ class _FoldingHandler(logging.Handler):
     def __init__(self, first_window: float) -> None:
         super().__init__()
         self._first_window = first_window
-        self._held: dict[str, tuple[str, int, threading.Timer]] = {}
+        self._waiting: dict[str, tuple[str, int, threading.Timer]] = {}
         self._windows: dict[str, float] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
         """Hold a line back; or count it, if another line of its kind is held back."""
         kind = str(record.msg)
-        if kind in self._held:
-            line, more, timer = self._held[kind]
-            self._held[kind] = (line, more + 1, timer)
+        if kind in self._waiting:
+            line, more, timer = self._waiting[kind]
+            self._waiting[kind] = (line, more + 1, timer)
             return
         window = self._windows.get(kind, self._first_window)
         self._windows[kind] = min(2 * window, _LONGEST_WINDOW)
         timer = threading.Timer(window, self._tell, (kind,))
         timer.daemon = True
-        self._held[kind] = (self.format(record), 0, timer)
+        self._waiting[kind] = (self.format(record), 0, timer)
         timer.start()
 
     def close(self) -> None:
         """Print all lines that are held back."""
-        for kind, (_, _, timer) in list(self._held.items()):
+        for kind, (_, _, timer) in list(self._waiting.items()):
             timer.cancel()
             self._tell(kind)
         super().close()
@@ -341,11 +341,11 @@ class _FoldingHandler(logging.Handler):
         # A timer calls it in its own thread.
         self.acquire()
         try:
-            held = self._held.pop(kind, None)
+            waiting = self._waiting.pop(kind, None)
         finally:
             self.release()
-        if held is not None:
-            line, more, _ = held
+        if waiting is not None:
+            line, more, _ = waiting
             # Only a traceback has several lines. No message in it begins a line as those of tfbus do.
             first, *traceback = line.split("\n")
             warn(f"{first} (and {more:,} more like it)" if more else first)

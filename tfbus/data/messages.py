@@ -247,7 +247,7 @@ def from_message(message: object) -> Any:
         return found[0](message, str(get(header, "frame_id")).lstrip("/"), _stamp(get(header, "stamp")))
     known = message if isinstance(message, Mapping) else [name for name in dir(message) if not name.startswith("_")]
     shown = ", ".join(sorted(map(str, known))[:10])
-    raise TypeError(f"a {type(message).__name__} is no message that can be transformed; its fields are {shown}")
+    raise TypeError(f"a {type(message).__name__} is not a message that can be transformed; its fields are {shown}")
 
 
 def to_message(data: Data, like: Any = dict) -> Any:

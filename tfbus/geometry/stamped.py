@@ -204,8 +204,8 @@ class QualifiedTransform(TransformStamped):
         return _restored, (type(self), self._fields, self._policy_use), getattr(self, "__dict__", None)
 
     def __str__(self) -> str:
-        held = f", extrapolated by {format_duration(self.extrapolated_by)}" if self.extrapolated_by else ""
-        return super().__str__() + held
+        remark = f", extrapolated by {format_duration(self.extrapolated_by)}" if self.extrapolated_by else ""
+        return super().__str__() + remark
 
 
 def answer_of(target: str, source: str, stamp: int, row: Row, static: bool) -> TransformStamped:

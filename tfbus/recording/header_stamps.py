@@ -82,7 +82,7 @@ def begins_with_header(channel: Channel) -> bool:
             field = line.partition("#")[0].split()
             if line.startswith("==="):
                 return False
-            # A constant is no field.
+            # A constant is not a field.
             if field and "=" not in line.partition("#")[0]:
                 return field[0] in _HEADER_TYPES
         return False

@@ -107,7 +107,7 @@ class Recorder:
     Raises
     ------
     ValueError, TypeError
-        If `capacity` is less than one, or no integer.
+        If `capacity` is less than one, or not an integer.
 
     Notes
     -----

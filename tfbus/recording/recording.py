@@ -485,7 +485,9 @@ def _open_storage(path: Path, folders: bool = False) -> Storage:
             return open_format(path)
         if magic.startswith(first):
             raise RecordingError(f"the file ends after {len(first)} bytes", path=str(path), reason="truncated")
-    raise RecordingError("it is no recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)", path=str(path), reason="foreign")
+    raise RecordingError(
+        "it is not a recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)", path=str(path), reason="foreign"
+    )
 
 
 # Each format imports packages of its own, so only the one of the file is imported.

@@ -298,8 +298,8 @@ def path_at(frames: Frames, target: str, source: str, at: int, newest: Path | No
     """The path that counts at a stamp.
 
     The newest path counts if all its edges hold and cover the stamp. Otherwise the parents at the stamp make the path.
-    If they form a loop, the way whose samples cover the stamp counts; if neither way is covered, the path has the other
-    way as its `rival`.
+    If they form a loop, the path whose samples cover the stamp counts; if neither is covered, the path has the other
+    path as its `rival`.
 
     Parameters
     ----------
@@ -313,43 +313,43 @@ def path_at(frames: Frames, target: str, source: str, at: int, newest: Path | No
     Raises
     ------
     DisconnectedError
-        If there is no way; or if the samples cover the stamp on two ways, and neither is the newest path.
+        If there is no path; or if the samples cover the stamp on two paths, and neither is the newest path.
     """
     if newest is not None and newest.holds(at):
         if newest.root not in frames or newest.covers(at):
             return newest
-        way = newest
+        path = newest
     else:
-        way = find_path(frames, target, source, at)
-    rival, loop = _other_way(frames, way, at)
+        path = find_path(frames, target, source, at)
+    rival, loop = _other_path(frames, path, at)
     if rival is None:
-        return way
+        return path
     if rival.covers(at):
-        if way.covers(at):
-            raise DisconnectedError(target=target, source=source, roots=(way.root, rival.root), stamp=at, loop=loop)
+        if path.covers(at):
+            raise DisconnectedError(target=target, source=source, roots=(path.root, rival.root), stamp=at, loop=loop)
         return rival
-    if way.covers(at):
-        return way
-    if way is newest:
+    if path.covers(at):
+        return path
+    if path is newest:
         # The newest path may be kept for other stamps, at which it has no rival.
-        way = Path(*_edges(frames, way), way.root)
-    elif rival.children < way.children:
+        path = Path(*_edges(frames, path), path.root)
+    elif rival.children < path.children:
         # The same one for both directions of the question.
-        way, rival = rival, way
-    way.rival = rival
-    return way
+        path, rival = rival, path
+    path.rival = rival
+    return path
 
 
-def _other_way(frames: Frames, way: Path, at: int) -> tuple[Path | None, tuple[str, ...]]:
-    """The other way round a loop at a stamp, if its top leads back to it, and the loop."""
+def _other_path(frames: Frames, path: Path, at: int) -> tuple[Path | None, tuple[str, ...]]:
+    """The other path round a loop at a stamp, if its top leads back to it, and the loop."""
     beyond: dict[str, FrameHistory] = {}
-    here = way.root
+    here = path.root
     while (edge := frames.get(here)) is not None and here not in beyond:
         beyond[here] = edge
         here = edge.parent_at(at)
-        if here not in way.frames:
+        if here not in path.frames:
             continue
-        ups, downs = _edges(frames, way)
+        ups, downs = _edges(frames, path)
         for side, other in ((ups, downs), (downs, ups)):
             below = [edge.child for edge in side]
             if here in below:

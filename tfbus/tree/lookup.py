@@ -408,10 +408,10 @@ def _find_latest(forest: Forest, path: Path, bounds: Bounds | None, extrapolatio
             # Another way may count there. It is sought outside, so that its error does not keep this traceback alive.
             pass
     try:
-        way = path
+        chosen = path
         if not path.permanent or path.root in forest.frames:
-            way = forest.find_path(path.frames[0], path.frames[-1], common)
-        row = way.row_at(common) if extrapolation is None else extrapolation.row(way, common)
+            chosen = forest.find_path(path.frames[0], path.frames[-1], common)
+        row = chosen.row_at(common) if extrapolation is None else extrapolation.row(chosen, common)
     except TransformLookupError as error:
         # The lagging edge has to reach the windows of the others, or the far end of their gap. Where a parent has
         # changed, any later stamp of the lagging edge may be enough.

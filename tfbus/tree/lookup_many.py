@@ -228,7 +228,7 @@ def plain_columns(forest: Forest, queries: Sequence[Query], with_nan: bool) -> l
     if kernel == "python":
         # Its chains have no `hold`: do not search for the paths first.
         return None
-    held: list[Any] = []
+    snapshots: list[Any] = []
     try:
         with forest.lock:
             for target, source, _ in queries:
@@ -238,11 +238,11 @@ def plain_columns(forest: Forest, queries: Sequence[Query], with_nan: bool) -> l
                     return None
                 # A stamp that this path does not cover may have an answer on another way round a loop of parents.
                 with_nan = with_nan and path.root not in forest.frames
-                held.append(samples)
+                snapshots.append(samples)
     except TransformLookupError:
         return None
     found: list[Floats] = []
-    for samples, (_, _, stamps) in zip(held, queries, strict=True):
+    for samples, (_, _, stamps) in zip(snapshots, queries, strict=True):
         columns = np.empty((7, len(stamps)))
         missing = samples.rows(np.ascontiguousarray(stamps), columns)
         if missing is None or (missing >= 0 and not with_nan):

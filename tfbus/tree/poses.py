@@ -39,7 +39,7 @@ class Poses(NamedTuple):
     nearest sample; the columns are NaN where an edge has no sample at all."""
     static: npt.NDArray[np.bool_]
     """Whether the edge between each frame and its parent is static, shape (n,); False for a root."""
-    heard: npt.NDArray[np.int64]
+    newest: npt.NDArray[np.int64]
     """The stamp (ns) of the newest sample of each frame, not after the stamp asked for, shape (n,); `STAMP_MIN` for a
     static frame, a root, and where there is none."""
 
@@ -114,22 +114,22 @@ class PoseReader:
             # At the stamp, a frame may have had another parent, or two in a loop.
             reparented = any(history.mixed for history in forest.frames.values())
             corrections = [_find(forest, fixed, frame, at) for frame in plan.frames] if reparented else []
-            static, heard = self._own_edges(plan, at)
+            static, newest = self._own_edges(plan, at)
         columns, answered = gathered.compose()
         for place, row in enumerate(corrections):
             answered[place] = row is not None
             if row is not None:
                 columns[:, place] = row
-        return Poses(tuple(plan.frames), columns, plan.parents, answered, static, heard)
+        return Poses(tuple(plan.frames), columns, plan.parents, answered, static, newest)
 
     def _own_edges(self, plan: _Plan, at: int | Latest) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
         """Whether the edge above each frame is static, and its newest stamp."""
         own = [self._forest.frames.get(frame) for frame in plan.frames]
         static = np.array([history is not None and history.static for history in own])
         if isinstance(at, Latest):
-            newest = [STAMP_MIN if history is None else _heard(history.newest) for history in own]
+            newest = [STAMP_MIN if history is None else _stamp_or_least(history.newest) for history in own]
         else:
-            newest = [STAMP_MIN if history is None else _heard(history.around(at)[0]) for history in own]
+            newest = [STAMP_MIN if history is None else _stamp_or_least(history.around(at)[0]) for history in own]
         return static, np.array(newest, np.int64)
 
     def _plan(self, fixed: str, at: int | Latest) -> _Plan:
@@ -230,7 +230,7 @@ class _Newest:
         self._origins = np.array(plan.origins, np.int64)
         is_moving = {child: place in moving for place, child in enumerate(plan.edges) if place}
         self._static = np.array([not is_moving.get(frame, True) for frame in plan.frames])
-        self._heard = np.array([is_moving.get(frame, False) for frame in plan.frames])
+        self._is_moving = np.array([is_moving.get(frame, False) for frame in plan.frames])
 
     def poses(self, records: Sequence[bytes]) -> Poses | None:
         """The poses; None if the records have several stamps, or an edge has none.
@@ -245,11 +245,11 @@ class _Newest:
         rows[self._places] = block[:, 1:]
         _turn_round(rows, self._upside_down)
         compose_paths(rows, self._origins)
-        heard = np.full(len(self._frames), STAMP_MIN)
+        newest = np.full(len(self._frames), STAMP_MIN)
         if len(stamps):
-            heard[self._heard] = stamps[0]
+            newest[self._is_moving] = stamps[0]
         answered = np.ones(len(self._frames), np.bool_)
-        return Poses(self._frames, rows.T, self._plan.parents, answered, self._static, heard)
+        return Poses(self._frames, rows.T, self._plan.parents, answered, self._static, newest)
 
 
 def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Latest) -> _Gathered:
@@ -316,7 +316,7 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
     return gathered
 
 
-def _heard(stamp: int | None) -> int:
+def _stamp_or_least(stamp: int | None) -> int:
     return STAMP_MIN if stamp is None else stamp
 
 

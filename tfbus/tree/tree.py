@@ -252,7 +252,7 @@ class TransformTree:
         Raises
         ------
         TypeError
-            As `lookup`. A lookup without an answer is no error here.
+            As `lookup`. Here, a lookup without an answer is not an error.
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         bounds = bounds_of(not_before, not_after)

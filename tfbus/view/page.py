@@ -283,9 +283,9 @@ class SceneReader:
         )
 
     def _codes(self, poses: Poses, now: int) -> npt.NDArray[np.intp]:
-        silent = poses.heard == STAMP_MIN
+        silent = poses.newest == STAMP_MIN
         # The age of a frame without samples would overflow.
-        stale = now - np.where(silent, now, poses.heard) > self._stale_after
+        stale = now - np.where(silent, now, poses.newest) > self._stale_after
         codes = np.where(silent, _SILENT, np.where(stale, _STALE, _MOVING))
         codes = np.where(poses.static | (poses.parents < 0), _STATIC, codes)
         has_pose = np.isfinite(poses.columns)

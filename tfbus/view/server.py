@@ -103,14 +103,14 @@ class _Messages:
         control: Any = self._server.gui._gui_input_handle_from_uuid[uuid]
         if isinstance(control, viser.GuiSliderHandle):
             if isinstance(value, bool) or not math.isfinite(value):
-                raise ValueError("this is no number")
+                raise ValueError("this is not a number")
             # Browsers round to the step.
             return min(max(float(value), control.min), control.max)
         if isinstance(control, viser.GuiDropdownHandle | viser.GuiButtonGroupHandle):
             if value not in control.options:
-                raise ValueError("this is no option")
+                raise ValueError("this is not an option")
         elif not isinstance(value, bool if isinstance(control, viser.GuiButtonHandle) else str):
-            raise TypeError("this is no value of such a control")
+            raise TypeError("this is not a value of such a control")
         return value
 
 

@@ -51,7 +51,7 @@ def bridge(
         if one.ros or not (listen or connect):
             raise UsageError(f"a bridge needs two places, not {first!r} twice")
         one = LinkOptions(one.domain, backend=backend)
-        names = f"{one.place} {one.way}", f"the same {other.way}"
+        names = f"{one.place} {one.route}", f"the same {other.route}"
     elif one.listen and other.listen:
         # Its router is in this program already.
         one = replace(one, listen=(), connect=tuple(map(_reachable, listen)))

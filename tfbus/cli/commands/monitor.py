@@ -165,10 +165,10 @@ def text_lines(arrivals: Sequence[Arrival], chain: Chain | None, width: int | No
 def _describe(chain: Chain) -> str:
     if not chain.frames:
         return f"no transform: {chain.problem}"
-    way = " <- ".join(chain.frames)
+    path = " <- ".join(chain.frames)
     age = "static" if chain.age is None else f"age {format_span(chain.age)}"
     slowest = f", the slowest is {chain.slowest}" if chain.slowest else ""
-    return f"{way}: {age}{slowest}"
+    return f"{path}: {age}{slowest}"
 
 
 def _row(arrival: Arrival) -> tuple[str, ...]:

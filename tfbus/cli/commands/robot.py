@@ -127,7 +127,7 @@ async def _follow(bus: Bus, link: LinkOptions, model: RobotModel | None, prefix:
 
 
 async def _model_of_ros(bus: Bus, link: LinkOptions) -> RobotModel:
-    """Wait for the URDF on /robot_description; raises `UsageError` if it is no robot."""
+    """Wait for the URDF on /robot_description; raises `UsageError` if it is not a robot."""
     described = anyio.Event()
     texts: list[str] = []
 

@@ -52,7 +52,7 @@ def tree(
         How many seconds to listen, from the first transform on; by default until every frame has been heard twice and
         all are connected, at least 1 and at most 5.
     watch
-        Show it live until Ctrl-C; if the output is no terminal, print it again and again.
+        Show it live until Ctrl-C; if the output is not a terminal, print it again and again.
     rate
         Updates per second, with --watch.
     dot
@@ -104,7 +104,7 @@ def tree(
                 await show_once()
                 for remark in remarks(buffer.tree.edges()):
                     say(remark)
-                link.say_who_is_heard(links)
+                link.print_peers(links)
 
     link.run(show_tree, clock=ReplayClock(), links=links)
 

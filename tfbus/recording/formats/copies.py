@@ -107,7 +107,7 @@ class MessageTypes:
         """The name of a type in ROS 2; raises `ValueError` if it has no package."""
         package, _, last = kind.rpartition("/")
         if not package:
-            raise ValueError(f"{kind!r} is no name of a type of ROS")
+            raise ValueError(f"{kind!r} is not the name of a type of ROS")
         return f"{package.removesuffix('/msg')}/msg/{last}"
 
     def convert(self, channel: Channel, payload: bytes) -> bytes:

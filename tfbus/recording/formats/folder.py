@@ -190,7 +190,7 @@ class SqliteStorage:
             if lost:
                 yield lost_message(now, f"{lost:,} messages are on topics that the file does not describe")
             if self._untimed:
-                yield lost_message(now, f"{self._untimed:,} messages have a timestamp that is no integer")
+                yield lost_message(now, f"{self._untimed:,} messages have a timestamp that is not an integer")
             promised = {channel: count or 0 for channel, count in self.channels.items() if wanted(channel)}
             yield from shortfalls(now, promised, read)
         if not self.finished and (until is None or until >= (self.end or 0)):

@@ -111,7 +111,7 @@ class ChunkPacker:
         present, which, counts = np.unique(numbers, return_inverse=True, return_counts=True)
         self._reading.count(dict(zip(present.tolist(), counts.tolist(), strict=True)))
         wanted = [self._place(self._reading.wanted_channel(number)) for number in present.tolist()]
-        # A log time that is no stamp becomes negative.
+        # A log time that is not a stamp becomes negative.
         whole = Packed(data, self._table, np.array(wanted, np.int64)[which], received.view(np.int64), starts, ends)
         yield from in_order(whole if min(wanted, default=0) >= 0 else whole.chosen(whole.numbers >= 0), low, high)
 

@@ -118,7 +118,7 @@ def parse_fields(header: bytes) -> Fields:
         name, equals, value = header[at + 4 : at + 4 + length].partition(b"=")
         at += 4 + length
         if not equals or at > len(header):
-            raise ValueError("a field of a header is no name with a value")
+            raise ValueError("a field of a header is not a name with a value")
         fields[name] = value
     return fields
 

@@ -156,7 +156,7 @@ def unfinished(received: int, read: Counter[Channel], why: str) -> StoredMessage
 def in_words(error: Exception) -> str:
     """The error of a parser in words for people; only a `ValueError` has such words already."""
     if isinstance(error, UnicodeDecodeError):
-        return "a text in it is no text"
+        return "a text in it is not UTF-8"
     return str(error) if isinstance(error, ValueError) else "it ends inside of a record, or a record is damaged"
 
 
@@ -169,7 +169,7 @@ def select(
 ) -> Iterator[StoredMessage]:
     """Iterate over the messages from one log time to another, inclusive, and count them by channel.
 
-    A message whose log time is no stamp becomes a lost one.
+    A message whose log time is not a stamp becomes a lost one.
     """
     low = STAMP_MIN if since is None else since
     high = STAMP_MAX if until is None else until
@@ -313,7 +313,7 @@ def merge_chunks(
     in_file_order = all(before.offset < after.offset for before, after in pairwise(places))
     waiting: list[StoredMessage] = []
     origins: list[int] = []
-    told = False
+    reported = False
     for number, place in enumerate(places, 1):
         following = places[number].start + in_file_order if number < len(places) else _END
         found = read(place)
@@ -329,8 +329,8 @@ def merge_chunks(
         ready = bisect_left(waiting, following, key=_log_time)
         if sum(MESSAGE_SIZE + len(payload) for _, _, payload in waiting[ready:]) > MAX_OVERLAPPING:
             ready = len(waiting)
-            if not told:
-                told = True
+            if not reported:
+                reported = True
                 detail = f"chunks of more than {MAX_OVERLAPPING:,} bytes overlap: their messages are not in order"
                 yield [lost_message(waiting[0][0], detail)]
         yield waiting[:ready]
@@ -583,7 +583,7 @@ def in_order(messages: Packed, low: int, high: int) -> Iterator[Stored]:
     Parameters
     ----------
     messages : Packed
-        In the order of the file; a log time that is no stamp is negative.
+        In the order of the file; a log time that is not a stamp is negative.
     low, high : int
         In ns.
     """

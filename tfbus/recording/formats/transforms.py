@@ -243,7 +243,7 @@ def _protobuf_parser(channel: Channel, single: bool) -> Callable[[bytes], list[R
             ) from None
         # The schema is in the file: a damaged one raises anything.
         except Exception as error:  # noqa: BLE001
-            raise MalformedMessageError("encoding", f"it is no message of its schema: {error!r}"[:200]) from None
+            raise MalformedMessageError("encoding", f"it is not a message of its schema: {error!r}"[:200]) from None
 
     return parse
 
@@ -256,13 +256,13 @@ def _protobuf_decoder(channel: Channel) -> Callable[[bytes], Any]:
     schema = Schema(id=1, name=channel.type, encoding="protobuf", data=channel.schema)
     decoder: Callable[[bytes], Any] | None = DecoderFactory().decoder_for("protobuf", schema)
     if decoder is None:
-        raise ValueError("its schema is no protobuf")
+        raise ValueError("its schema is not protobuf")
     return decoder
 
 
 def _raw(seconds: int, nanoseconds: int, parent: str, child: str, numbers: Sequence[float]) -> RawTransform:
     if not all(isinstance(number, int) for number in (seconds, nanoseconds)):
-        raise TypeError("a stamp is no integer")
+        raise TypeError("a stamp is not an integer")
     return RawTransform(seconds, nanoseconds, parent.encode(), child.encode(), _NUMBERS.pack(*numbers))
 
 
@@ -434,7 +434,7 @@ class _Values(NamedTuple):
     """ns."""
     rows: npt.NDArray[np.float64]
     """Shape (n, 7): translation and unit quaternion (x, y, z, w)."""
-    sound: npt.NDArray[np.bool_]
+    valid: npt.NDArray[np.bool_]
     """Whether it is valid for certain."""
 
 
@@ -520,7 +520,7 @@ class ColumnDecoder:
                 rest[places] = False
             for place, slot in enumerate(parts[0][0].slots):
                 values = _values(matrix, slot, decoder.channel.encoding == "cdr")
-                if not (values.sound | rest).all():
+                if not (values.valid | rest).all():
                     return False
                 for layout, places in parts:
                     frame = layout.slots[place]
@@ -634,9 +634,9 @@ def _values(matrix: npt.NDArray[np.uint8], slot: _Slot, signed: bool) -> _Values
     times = np.ascontiguousarray(matrix[:, slot.stamp : slot.stamp + 8]).view("<u4")
     rows = np.ascontiguousarray(matrix[:, slot.numbers : slot.numbers + 56]).view("<f8")
     nanoseconds = times[:, 1]
-    sound = nanoseconds < SECOND
+    valid = nanoseconds < SECOND
     for axis in range(3):
-        sound &= np.abs(rows[:, axis]) < _LARGE
+        valid &= np.abs(rows[:, axis]) < _LARGE
     i, j, k, w = rows[:, 3], rows[:, 4], rows[:, 5], rows[:, 6]
     # Overflow and NaN are found by the comparison.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -644,14 +644,14 @@ def _values(matrix: npt.NDArray[np.uint8], slot: _Slot, signed: bool) -> _Values
         even = np.abs(square - 1.0) <= ROUNDING
         if not even.all():
             norm = np.sqrt(square)
-            sound &= np.abs(norm - 1.0) <= NORM_TOLERANCE
+            valid &= np.abs(norm - 1.0) <= NORM_TOLERANCE
             rows = rows.copy()
-            uneven = sound & ~even
+            uneven = valid & ~even
             rows[uneven, 3:] /= norm[uneven, None]
     seconds = times[:, 0].view(np.int32 if signed else np.uint32).astype(np.int64)
     if not signed:
-        sound &= seconds < 2**31
-    return _Values(seconds * SECOND + nanoseconds, rows, sound)
+        valid &= seconds < 2**31
+    return _Values(seconds * SECOND + nanoseconds, rows, valid)
 
 
 def _merge(parts: list[Columns]) -> Columns:
