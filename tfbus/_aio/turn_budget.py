@@ -7,7 +7,7 @@ from typing import Final
 import anyio.lowlevel
 
 TURN: Final = 0.001
-"""s; two such pieces of work, each late by one message, stay within 5 ms."""
+"""In s: two such pieces of work, each late by one message, stay within 5 ms."""
 
 # A coarse clock, as on Windows, would let a turn go on for many times as long.
 _HAS_FINE_CLOCK = time.get_clock_info("thread_time").resolution <= TURN / 10
@@ -15,7 +15,7 @@ _busy: Final = time.thread_time if _HAS_FINE_CLOCK else time.monotonic
 
 
 class TurnBudget:
-    """Tells work that others feed, such as the messages of a network, when other tasks have to get their turn.
+    """Tells long work, such as reading messages of a network, when other tasks have to get their turn.
 
     The time in which the thread waits for a processor does not count: on a crowded machine each turn would end after
     its first message, and the work would never be done.

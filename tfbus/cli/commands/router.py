@@ -16,10 +16,10 @@ def router(
     connect: tuple[str, ...] = (),
     backend: Backend = "asyncio",
 ) -> None:
-    """Pass on what programs of all domains send each other, until Ctrl-C.
+    """Connect the programs of all domains with each other, until Ctrl-C.
 
-    For programs on several machines, or of several users of one. They connect to it with --connect; each program needs
-    one router, and routers that are connected are as one.
+    A router is for programs on several machines, or of several users of one machine. They join with --connect. Each
+    program needs one router; connected routers act as one.
 
     Example: tfbus router --listen tcp/192.168.1.5:7447
 
@@ -37,7 +37,7 @@ def router(
         from tfbus.links.zenoh import ZenohRouter
         from tfbus.links.zenoh.zenoh_router import ROUTER
     except ImportError:
-        raise UsageError(f"a router needs a package more: {pip_install('cli,zenoh')}") from None
+        raise UsageError(f"a router needs one more package: {pip_install('cli,zenoh')}") from None
 
     addresses = listen or (ROUTER,)
 
