@@ -16,7 +16,6 @@ from threading import Timer
 from typing import Any, NamedTuple
 
 import anyio
-
 from support.peer_process import link_of
 from support.processes import Place
 
