@@ -2472,14 +2472,17 @@ judge_accepts(Judge *self, PyObject *batch)
         }
     }
     const int plain = judged == size;
+    const int64_t earliest = self->earliest;
+    long long behind = 0;
     for (Py_ssize_t i = 0; plain && i < size; i++) {
         const int64_t stamp = ((const Sample *)PyTuple_GetItem(batch, i))->stamp;
         if (!edges[i]->has_newest || stamp > edges[i]->newest) {
             edges[i]->newest = stamp;
             edges[i]->has_newest = 1;
         }
-        self->behind += stamp < self->earliest;
+        behind += stamp < earliest;
     }
+    self->behind += behind;
     if (edges != few) {
         PyMem_Free(edges);
     }
@@ -2995,11 +2998,10 @@ intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
     Trouble trouble = {NULL};
     /* After an error of one buffer, the others get the batch too, because the bus has judged it. */
     for (Py_ssize_t i = 0; i < count; i++) {
-        PyObject *pair = PyTuple_GetItem(feeds, i), *feed, *insert;
-        PyObject *done = PyArg_ParseTuple(pair, "O!O", FeedType, &feed, &insert) ? feed_insert((Feed *)feed, batch) : NULL;
+        PyObject *pair = PyTuple_GetItem(feeds, i), *done = feed_insert((Feed *)PyTuple_GetItem(pair, 0), batch);
         if (done == Py_False) {
             Py_DECREF(done);
-            done = PyObject_CallFunctionObjArgs(insert, batch, NULL);
+            done = PyObject_CallFunctionObjArgs(PyTuple_GetItem(pair, 1), batch, NULL);
         }
         if (done == NULL) {
             set_aside(&trouble);
@@ -3025,8 +3027,17 @@ intake_feeds(Intake *self, void *Py_UNUSED(closure))
 static int
 intake_set_feeds(Intake *self, PyObject *value, void *Py_UNUSED(closure))
 {
-    if (value == NULL || !PyTuple_CheckExact(value)) {
-        PyErr_SetString(PyExc_TypeError, "feeds must be a tuple");
+    Py_ssize_t pairs = 0;
+    const Py_ssize_t size = value != NULL && PyTuple_CheckExact(value) ? PyTuple_Size(value) : -1;
+    for (; pairs < size; pairs++) {
+        PyObject *pair = PyTuple_GetItem(value, pairs);
+        if (!PyTuple_CheckExact(pair) || PyTuple_Size(pair) != 2
+            || !PyObject_TypeCheck(PyTuple_GetItem(pair, 0), FeedType)) {
+            break;
+        }
+    }
+    if (pairs != size) {
+        PyErr_SetString(PyExc_TypeError, "feeds must be a tuple of pairs of a Feed and a callable");
         return -1;
     }
     PyObject *old = self->feeds;
