@@ -350,8 +350,12 @@ class Link:
         """Send what has gathered at the end of this turn of the event loop. Called by the end."""
         if pending >= _FULL_TURN:
             self._end.send()
-        else:
+            return
+        try:
             self._turn_ends.wake()
+        except RuntimeError as error:
+            problem = "the event loop in which it was entered has ended, and not the link"
+            raise RuntimeError(f"{self!r} sends nothing any more: {problem}") from error
 
     def is_behind(self) -> bool:
         """Whether items wait to be handled. Called by the end."""
