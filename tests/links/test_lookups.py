@@ -80,6 +80,16 @@ async def asked(**options: Any) -> AsyncIterator[Scene]:
         assert other.statistics().samples == 0, "a link of rate 0 hears nothing but answers"
 
 
+async def test_a_server_is_entered_once_and_is_the_only_one_of_its_link() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with DomainLink(bus, "tf", MemoryNetwork().wire("r1"), robot="r1") as link:
+            async with BufferServer(buffer, link) as server:
+                with pytest.raises(RuntimeError, match="serves a buffer already"):
+                    await BufferServer(buffer, link).__aenter__()
+            with pytest.raises(RuntimeError, match="entered once"):
+                await server.__aenter__()
+
+
 @pytest.mark.every_loop
 async def test_a_lookup_is_answered_at_once_or_waits_there_until_it_can_be() -> None:
     async with asked() as scene:
