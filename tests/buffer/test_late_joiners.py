@@ -279,6 +279,11 @@ def test_only_the_prefilled_edges_in_the_loop_are_removed() -> None:
     )
     bus.publish(moving("c", "b", 60))
     assert [(edge.parent, edge.child) for edge in late.tree.edges()] == [("r", "a"), ("c", "b"), ("b", "d")]
+    # One that the bus has as well keeps its later samples.
+    bus = bus_with([moving("a", "b", 50)])
+    late = Buffer(bus, prefill=tree_of(moving("a", "b", 90), moving("c", "a", 40)))
+    bus.publish(moving("b", "c", 60))
+    assert [(edge.parent, edge.child) for edge in late.tree.edges()] == [("a", "b"), ("b", "c")]
 
 
 @pytest.mark.parametrize("heard", [89, 90, 91])

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from start_together import measure
-from support.processes import PATIENCE, Crowd, PeerProcess, crowd, free_address, new_domain
+from support.processes import PATIENCE, Crowd, PeerProcess, Place, crowd
 
 pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
 thorough = pytest.mark.thorough
@@ -32,27 +32,6 @@ SOON = 3.0
 def processes() -> Iterator[Crowd]:
     with crowd() as together:
         yield together
-
-
-class Place:
-    """A domain of one test: on this machine, or behind the router in the process of its first member."""
-
-    def __init__(self, carrier: str) -> None:
-        self.carrier = carrier
-        self.domain = new_domain()
-        self.address = free_address()
-
-    def first(self, **options: Any) -> dict[str, Any]:
-        return self._link("listen", options)
-
-    def other(self, **options: Any) -> dict[str, Any]:
-        return self._link("connect", options)
-
-    def _link(self, side: str, options: dict[str, Any]) -> dict[str, Any]:
-        if self.carrier == "router":
-            return {"domain": self.domain, side: self.address, **options}
-        options.pop("lease", None)
-        return {"domain": self.domain, **options}
 
 
 @pytest.fixture(params=["local", "router"])
@@ -329,5 +308,5 @@ def test_ctrl_c_ends_a_program_with_a_link(backend: str, processes: Crowd, place
 
 
 @thorough
-def test_processes_that_start_together_all_have_every_static_frame() -> None:
-    assert max(measure(processes=8)) < PATIENCE
+def test_processes_that_start_together_all_have_every_static_frame(place: Place) -> None:
+    assert max(facts.met for facts in measure(8, place)) < PATIENCE

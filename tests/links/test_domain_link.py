@@ -233,7 +233,9 @@ async def test_a_link_that_nobody_enters_says_so() -> None:
     ]
 
 
-def test_items_received_after_a_crash_of_the_event_loop_do_no_harm() -> None:
+def test_after_a_crash_of_the_event_loop_what_comes_does_no_harm_and_what_is_published_says_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     network = MemoryNetwork()
 
     async def crash(bus: Bus) -> DomainLink:
@@ -251,6 +253,8 @@ def test_items_received_after_a_crash_of_the_event_loop_do_no_harm() -> None:
         for _ in range(3):
             network.wires[link.id].receive("peer", b"anything")
         assert link.statistics().queue.pending == 3
+        bus.publish(moving("map", "a", 1))
+    assert "<DomainLink 'tf': 0 peers> sends nothing any more: the event loop in which it was entered" in caplog.text
 
 
 # Under load

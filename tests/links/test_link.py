@@ -12,6 +12,7 @@ from support.processes import until
 from support.samples import moving, static
 
 from tfbus import Bus, PeerJoined, PeerLost, PeerRejected, SimulatedClock
+from tfbus._aio.turn_budget import TurnBudget
 from tfbus.links import Link
 from tfbus.links.endpoint import ForeignEnd
 from tfbus.links.relay import Turn
@@ -79,10 +80,14 @@ def link_of(
     return Link(ForeignEnd(bus, "world", carrier, frames, drop_lost, max_frames), **options)
 
 
-def slow_clock(step: float) -> Callable[[], float]:
-    """A monotonic clock for which so many s pass from one look to the next."""
+def slow_budget(step: float) -> TurnBudget:
+    """A budget by a clock for which so many s pass from one look to the next."""
     looks = count()
-    return lambda: next(looks) * step
+
+    def clock() -> float:
+        return next(looks) * step
+
+    return TurnBudget(now=clock, busy=clock)
 
 
 async def receive_samples(link: Link, samples: int) -> None:
@@ -157,7 +162,7 @@ async def test_what_was_published_last_goes_out_while_the_carrier_still_runs() -
 async def test_threads_may_bring_messages_in_any_number_and_the_loop_has_time_for_others() -> None:
     carrier = LoggedCarrier()
     with Bus() as bus:
-        async with link_of(bus, carrier, now=slow_clock(0.0001)) as link:
+        async with link_of(bus, carrier, budget=slow_budget(0.0001)) as link:
 
             def bring() -> None:
                 for stamp in range(2_000):
@@ -195,7 +200,7 @@ class SplittingForeignCarrier(LoggedCarrier):
 async def test_a_message_that_its_carrier_splits_takes_several_turns_and_is_counted_once() -> None:
     carrier = SplittingForeignCarrier(fails="broken")
     with Bus() as bus:
-        async with link_of(bus, carrier, now=slow_clock(0.001)) as link:
+        async with link_of(bus, carrier, budget=slow_budget(0.001)) as link:
             many = [ARM._replace(child=f"arm{number}", stamp=1) for number in range(50)]
             carrier.receive(Received("driver", ForeignMessage(False, [*many, ARM._replace(child="broken"), ARM])))
             carrier.receive(Received("driver", ForeignMessage(False, [ARM._replace(stamp=2)])))
@@ -211,7 +216,7 @@ async def test_a_message_that_its_carrier_splits_takes_several_turns_and_is_coun
 async def test_the_rest_of_a_split_message_is_dropped_when_the_clock_jumps_back() -> None:
     clock, carrier = SimulatedClock(start=10), SplittingForeignCarrier()
     with Bus(clock) as bus:
-        async with link_of(bus, carrier, now=slow_clock(0.001)) as link:
+        async with link_of(bus, carrier, budget=slow_budget(0.001)) as link:
             many = [ARM._replace(child=f"arm{number}") for number in range(50)]
             carrier.receive(Received("driver", ForeignMessage(False, many), moving=True))
             while link.statistics().received_samples < 5:

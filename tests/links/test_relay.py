@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import strategies as some
-from support.domains import Network, Process, World, agree
+from support.domains import Network, Process, Stranger, World, agree
 from support.processes import peak_of
 from support.samples import moving, static
 
@@ -257,6 +257,27 @@ def test_a_frame_that_a_lost_bus_has_taken_over_is_gone_until_it_is_said_again()
     late = world.process(one.wire.network, drop_lost=True)
     world.run(5.0)
     assert one.frames == three.frames == late.frames == {"tool": static("map", "tool", 3.0)}
+
+
+@pytest.mark.parametrize("drop_lost", [False, True])
+@pytest.mark.parametrize("late", [False, True])
+def test_what_a_lost_bus_has_said_does_not_take_a_frame_over_when_it_is_late_and_is_not_heard_again(
+    late: bool, drop_lost: bool
+) -> None:
+    world = World()
+    network = Network(world)
+    listener = world.process(network, drop_lost=drop_lost)
+    old, new, bridge = (Stranger(network) for _ in range(3))
+    said = old.batch(moving("map", "base", 1), number=10)
+    # A program that was started again may be read first.
+    sayings = [lambda: old.say(said), lambda: new.say(new.batch(moving("map", "base", 2), number=20))]
+    for say in sayings[:: -1 if late else 1]:
+        say()
+    network.remove(old)
+    world.run(1.0)
+    assert listener.frames == {"base": moving("map", "base", 2)}
+    bridge.say(said)
+    assert len(listener.seen) == 2
 
 
 def test_what_was_said_beyond_a_bridge_that_was_cut_off_holds_against_what_was_said_before() -> None:

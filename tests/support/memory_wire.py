@@ -104,6 +104,9 @@ class MemoryWire:
     def is_heard(self, channel: str) -> bool:
         return any(other.channel_of(self.robot) == channel for other in self._others())
 
+    def is_behind(self) -> bool:
+        return False
+
     def publish(self, channel: str, message: bytes) -> None:
         for other in self._others():
             if other.channel_of(self.robot) == channel and self.id in other.met:

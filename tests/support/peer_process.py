@@ -255,6 +255,7 @@ class Program:
             "x": self.x,
             "longest_pause": self.longest_pause,
             "megabytes": pages * 4096 / 1e6,
+            "cpu": time.process_time(),
         }
 
 

@@ -187,6 +187,15 @@ def states(scene: Scene) -> dict[str, EdgeState]:
     return dict(zip(scene.frames, scene.states, strict=True))
 
 
+def test_poses_are_positions_and_quaternions_with_w_first() -> None:
+    tree = TransformTree()
+    tree.insert(TransformStamped("map", "base", 0, Transform((1, 2, 3), (0.1, 0.3, 0.5, 0.8062257748298549))))
+    scene = read(tree)
+    assert scene.frames == ("map", "base")
+    assert scene.positions.tolist() == [[0, 0, 0], [1, 2, 3]]
+    assert scene.wxyzs[1] == pytest.approx([0.8062257748298549, 0.1, 0.3, 0.5])
+
+
 def test_a_line_goes_from_each_frame_to_its_parent_in_the_colour_of_the_frame() -> None:
     scene = read(tree_of(moving("map", "odom", 0, 1.0), static("odom", "base", 2.0)), fixed="odom")
     assert scene.frames == ("odom", "base", "map")

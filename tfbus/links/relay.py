@@ -25,6 +25,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from math import inf
 from time import time_ns
 from typing import Any
 
@@ -213,6 +214,8 @@ class Peer:
         Whether it has announced that it is there.
     robot : str
         The robot whose link it is; empty without one.
+    rate : float
+        How often its newest samples are wanted, in Hz; infinite for everything, 0 for nothing.
     number : int
         That of its newest live message; 0 before the first.
     authorities : set of str
@@ -227,12 +230,24 @@ class Peer:
         The reasons of refusals that were reported.
     """
 
-    __slots__ = ("authorities", "authority_text", "frames", "id", "number", "paths", "present", "reported", "robot")
+    __slots__ = (
+        "authorities",
+        "authority_text",
+        "frames",
+        "id",
+        "number",
+        "paths",
+        "present",
+        "rate",
+        "reported",
+        "robot",
+    )
 
     def __init__(self, id: str) -> None:  # noqa: A002 - the wire calls it so
         self.id = id
         self.present = False
         self.robot = ""
+        self.rate = inf
         self.number = 0
         self.authorities: set[str] = set()
         self.authority_text = 0
@@ -586,12 +601,11 @@ class Relay:
         passed, foreign = self._passed, origin == self.origin
         settled, removed = self._settled, self._removed
         for sample in samples:
-            fields = sample._fields
-            child = fields[1]
+            child, static = sample.child, sample.static
             # A static one with an origin has to be ranked, so that all buses agree in the end.
-            if passed is not None and (foreign or not fields[5]) and sample in passed:
+            if passed is not None and (foreign or not static) and sample in passed:
                 continue
-            if (child in settled or child in removed or fields[5]) and self._is_outranked(sample, rank):
+            if (child in settled or child in removed or static) and self._is_outranked(sample, rank):
                 continue
             known = newest.get(child)
             if known is None:
@@ -610,7 +624,7 @@ class Relay:
             sample._provenance = provenance
             news.append(sample)
         for sample in news[before:] if before else news:
-            newest[sample._fields[1]] = sequence
+            newest[sample.child] = sequence
         if not newest:
             del self._newest[origin]
         return refused
@@ -631,12 +645,15 @@ class Relay:
                 provenance = Provenance(self.origin, self._next_number())
             samples = tuple(group)
             for sample in samples:
-                fields = sample._fields
+                child = sample.child
                 if self._passed is not None:
                     self._passed.add(sample)
-                self._latest[fields[1]] = provenance
-                if fields[5]:
-                    self._settled[fields[1]] = provenance.rank
+                latest = self._latest.get(child)
+                # A sample of another bus that is late does not make the frame its own.
+                if latest is None or latest.sequence < provenance.sequence or latest.rank < provenance.rank:
+                    self._latest[child] = provenance
+                if sample.static:
+                    self._settled[child] = provenance.rank
             outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
             for outbox in self._outboxes:
                 outbox.add_batch(outgoing, echo=outbox is provenance.outbox)
