@@ -1,3 +1,7 @@
+import threading
+from collections import Counter
+from functools import partial
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -211,3 +215,39 @@ def test_the_queue_behaves_like_a_list(capacity: int, steps: list[str]) -> None:
         dropped += len(gone)
         assert (len(queue), queue.statistics().dropped) == (len(model), dropped)
     assert drained(queue) == [item.content for item in model]
+
+
+def test_threads_that_put_and_get_at_once_lose_nothing_uncounted_and_keep_the_order() -> None:
+    queue = ReceiveQueue(50)
+    done = threading.Event()
+    taken: list[list[Received]] = [[], []]
+
+    def put(name: str) -> None:
+        for number in range(5_000):
+            queue.put(Received(name, number, 10, moving=number % 3 > 0))
+
+    def take(into: list[Received]) -> None:
+        while not done.is_set() or len(queue):
+            item = queue.get()
+            if item is not None:
+                into.append(item)
+
+    takers = [threading.Thread(target=partial(take, into)) for into in taken]
+    putters = [threading.Thread(target=partial(put, name)) for name in "abcd"]
+    for thread in (*takers, *putters):
+        thread.start()
+    for thread in putters:
+        thread.join(60)
+    done.set()
+    for thread in takers:
+        thread.join(60)
+        assert not thread.is_alive()
+    everything = [item for into in taken for item in into]
+    assert len(everything) + queue.statistics().dropped == 20_000
+    assert Counter(item.sender for item in everything if not item.moving) == dict.fromkeys("abcd", 1_667)
+    assert len({(item.sender, item.content) for item in everything}) == len(everything)
+    for into in taken:
+        last: dict[str, int] = {}
+        for item in into:
+            assert item.content > last.get(item.sender, -1)
+            last[item.sender] = item.content

@@ -23,12 +23,10 @@ from tfbus import (
     Buffer,
     Bus,
     BusClosedError,
-    ClockResetError,
     DisconnectedError,
     FutureExtrapolationError,
     LookupTimeoutError,
     MessageFilter,
-    PastExtrapolationError,
     PointStamped,
     SimulatedClock,
     TransformStamped,
@@ -130,26 +128,6 @@ async def test_a_message_with_an_available_transform_is_delivered(bus: Bus, buff
     assert found.transform.translation == (5.0, 0.0, 0.0)
 
 
-async def test_a_full_queue_drops_the_oldest_messages(bus: Bus, buffer: Buffer, streams: Streams) -> None:
-    drops = DroppedMessages()
-    bus.publish(moving("map", "laser", 0))
-    async with MessageFilter(streams.receive, buffer, "map", capacity=10, on_drop=drops) as pairs:
-        for stamp in range(1, 21):
-            put(streams, Scan(stamp))
-            await settle()
-        assert drops.told == [(Scan(stamp), "queue full") for stamp in range(1, 11)]
-        assert pairs.dropped == {"queue full": 10}
-        for stamp, (_, _, error) in enumerate(drops.all, 1):
-            assert isinstance(error, FutureExtrapolationError)
-            assert (error.child, error.stamp, error.newest) == ("laser", stamp, 0)
-        # No lookup goes on for a message that was dropped.
-        assert [waiting.question.at for waiting in buffer.pending()] == list(range(11, 21))
-        bus.publish(moving("map", "laser", 20))
-        await settle()
-        assert stamps([await anext(pairs) for _ in range(10)]) == list(range(11, 21))
-        assert (pairs.arrived, pairs.delivered, pairs.pending) == (20, 10, 0)
-
-
 def test_the_defaults_that_type_checkers_and_pages_show_are_those_of_the_filter() -> None:
     def defaults(function: Callable[..., object]) -> dict[str, object]:
         return {name: parameter.default for name, parameter in signature(function).parameters.items()}
@@ -205,19 +183,6 @@ async def test_a_tolerance_requires_the_transform_after_the_stamp_too(
         await settle()
         assert pairs.dropped == {"too old": 1}
         tasks.cancel_scope.cancel()
-
-
-async def test_a_message_older_than_the_buffer_is_dropped_at_once(bus: Bus, buffer: Buffer, streams: Streams) -> None:
-    drops = DroppedMessages()
-    bus.publish(driving("map", "laser", 100.0, authority="odometry"))
-    async with MessageFilter(streams.receive, buffer, "map", on_drop=drops) as pairs:
-        put(streams, Scan(99 * SECOND))
-        await settle()
-        ((message, reason, error),) = drops.all
-        assert (message, reason) == (Scan(99 * SECOND), "too old")
-        assert isinstance(error, PastExtrapolationError)
-        assert (error.child, error.authority) == ("laser", "odometry")
-        assert (pairs.pending, pairs.dropped) == (0, {"too old": 1})
 
 
 # Frames and stamps
@@ -308,29 +273,6 @@ async def test_a_transform_in_the_turn_in_which_the_timeout_expires_delivers_the
         bus.publish(moving("map", "laser", 5))
         assert (await anext(pairs))[0] == Scan(5)
         assert dict(pairs.dropped) == {}
-
-
-async def test_a_jump_back_drops_waiting_messages_and_delivers_ready_ones(
-    clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    drops = DroppedMessages()
-    await clock.advance(10.0)
-    bus.publish(driving("map", "laser", 10.0))
-    async with MessageFilter(streams.receive, buffer, "map", on_drop=drops) as pairs:
-        put(streams, Scan(10 * SECOND), Scan(11 * SECOND), Scan(11 * SECOND, "nobody"))
-        await settle()
-        clock.set(10 * SECOND)
-        assert pairs.dropped == {}, "it has not jumped back"
-        clock.set(5 * SECOND)
-        assert pairs.dropped == {"clock reset": 2}
-        ((_, _, error), _) = drops.all
-        assert isinstance(error, ClockResetError)
-        assert (error.before, error.after) == (10 * SECOND, 5 * SECOND)
-        assert (await anext(pairs))[0] == Scan(10 * SECOND)
-        put(streams, Scan(6 * SECOND))
-        await settle()
-        bus.publish(driving("map", "laser", 6.0))
-        assert (await anext(pairs))[0] == Scan(6 * SECOND)
 
 
 # The callback

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from support.asking import Asked
 
 from tfbus import SECOND, Buffer, Bus, MessageFilter, SimulatedClock, Transform, TransformStamped, UnknownFrameError
-from tfbus.errors import TransformError
+from tfbus.errors import ClockResetError, LookupTimeoutError, PastExtrapolationError, TransformError
 from tfbus.message_filter.message_filter import DropReason, MessageOverflow, Order
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]
@@ -30,6 +30,13 @@ Run = Callable[[Callable[[], Awaitable[None]]], None]
 SPEED = {"laser": 1.0, "camera": 10.0}
 ODOM_IN_MAP = 1_000.0
 START, KEEP = 100, 4
+ERRORS: dict[str, type[TransformError]] = {
+    "too old": PastExtrapolationError,
+    "timed out": LookupTimeoutError,
+    "unknown frame": LookupTimeoutError,
+    "clock reset": ClockResetError,
+}
+"""The errors of what is dropped; a message that was ready has none."""
 
 
 class Message(NamedTuple):
@@ -233,7 +240,7 @@ class Game:
         await self.clock.advance(seconds)
 
     def note(self, message: Message, reason: DropReason, error: TransformError | None) -> None:
-        assert error is not None or reason in ("queue full", "closed")
+        assert isinstance(error, ERRORS.get(reason, TransformError)) or (error is None and reason not in ERRORS)
         self.dropped.append((message, reason))
 
     # Steps, for the filter and for the model

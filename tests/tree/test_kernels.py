@@ -465,6 +465,15 @@ def judged_sample(kernel: ModuleType, *, child: str = "a", stamp: int = 20, x: f
     return sample(kernel, child, stamp, row=row, **{"parent": "map", "authority": "me", **other})
 
 
+@on_both
+def test_no_batch_is_plain_once_the_bounds_are_out_of_date(kernel: Any) -> None:
+    judge = kernel.Judge(known_edges(kernel), 81.0)
+    judge.allow(STAMP_MIN, STAMP_MAX, 0)
+    assert not judge.accepts((judged_sample(kernel),))
+    judge.allow(STAMP_MIN, STAMP_MAX, STAMP_MAX)
+    assert judge.accepts((judged_sample(kernel),))
+
+
 @needs_both
 def test_wrong_arguments_of_a_judge_raise() -> None:
     kernel: Any = COMPILED
