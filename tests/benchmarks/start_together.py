@@ -83,7 +83,7 @@ def measure(processes: int, place: Place, seconds: float = 0.0) -> list[Facts]:
         subprocess.run(imports, env=compiled, cwd=Path(__file__).parent, check=True)
         try:
             for number in range(processes):
-                task = {"number": number, "processes": processes, "seconds": seconds}
+                task: dict[str, Any] = {"number": number, "processes": processes, "seconds": seconds}
                 task["link"] = place.other() if number else place.first()
                 command = [sys.executable, __file__, json.dumps(task)]
                 started.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=compiled))
