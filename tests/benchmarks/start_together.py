@@ -45,13 +45,11 @@ async def live(number: int, processes: int, link: dict[str, Any], seconds: float
     def note(batch: tuple[TransformStamped, ...]) -> None:
         nonlocal met
         now = time.time_ns()
-        if not batch[0].static:
-            if met + seconds / 2 < time.monotonic() and batch[0].authority != f"p{number}":
-                delays.append((now - batch[0].stamp) / SECOND)
-            return
-        held.update(sample.child for sample in batch)
-        if len(held) == wanted:
-            met = min(met, time.monotonic())
+        if len(held) < wanted:
+            held.update(sample.child for sample in batch if sample.static)
+            met = time.monotonic() if len(held) == wanted else met
+        elif not batch[0].static and batch[0].authority != f"p{number}" and met + seconds / 2 < time.monotonic():
+            delays.append((now - batch[0].stamp) / SECOND)
 
     with Bus() as bus:
         bus.subscribe(note)
@@ -85,7 +83,7 @@ def measure(processes: int, place: Place, seconds: float = 0.0) -> list[Facts]:
         subprocess.run(imports, env=compiled, cwd=Path(__file__).parent, check=True)
         try:
             for number in range(processes):
-                task = {"number": number, "processes": processes, "seconds": seconds}
+                task: dict[str, Any] = {"number": number, "processes": processes, "seconds": seconds}
                 task["link"] = place.other() if number else place.first()
                 command = [sys.executable, __file__, json.dumps(task)]
                 started.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=compiled))
