@@ -88,6 +88,21 @@ def test_a_filtered_link_has_its_frames_after_any_loss_and_the_others_theirs_of_
     assert network.sent(Kind.QUESTION) <= 4
 
 
+@pytest.mark.parametrize("how_many", [1, 3])
+def test_a_filtered_link_that_met_others_while_nothing_came_through_has_its_frames_soon_after(how_many: int) -> None:
+    world = World()
+    network = Network(world)
+    others = [world.process(network) for _ in range(how_many)]
+    for number, process in enumerate(others):
+        process.say(static("map", f"{number}"))
+    network.loss = 1.0
+    some = world.process(network, frames=[f"{number}" for number in range(how_many)])
+    world.run(120.0)
+    network.loss = 0.0
+    world.run(10.0)
+    assert len(some.frames) == how_many
+
+
 def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_their_frames() -> None:
     world = World()
     network = Network(world)

@@ -87,6 +87,8 @@ PATIENCE = 3.0
 LONGEST_DELAY = 10.0
 """s; so long a link that has no time to read puts all its questions off, and then asks one."""
 _LONGEST_PAUSE = 60.0
+_PAUSE_OF_UNKNOWN = 4.0
+"""s; the longest pause before a link with a filter that has said nothing yet is asked again, for each such link."""
 _ASK_AGAIN = 30.0
 _SPARE = 1_000
 _NEVER = -inf
@@ -616,7 +618,11 @@ class Agreement:
     def _fail(self, copy: _Copy, now: float) -> None:
         copy.silences = min(copy.silences + 1, 10)
         copy.missed = True
-        copy.due = now + min(uniform(0.3, 0.7) * 2**copy.silences, _LONGEST_PAUSE)
+        longest = _LONGEST_PAUSE
+        if copy.must_ask and copy.claim is None:
+            # It may not know the filter, and then it signs on no channel that is heard here.
+            longest = min(longest, _PAUSE_OF_UNKNOWN * sum(each.claim is None for each in self._copies.values()))
+        copy.due = now + min(uniform(0.3, 0.7) * 2**copy.silences, longest)
 
     def _due_of(self, peer: str) -> float:
         copy = self._copies[peer]
