@@ -234,7 +234,7 @@ def test_frames_that_come_go_and_change_for_ever_take_no_more_memory() -> None:
     assert peak_of(change) < 4_500_000
 
 
-# Whom to ask, and when
+# The next question
 
 
 class Asker:
@@ -386,7 +386,7 @@ def pauses(link: Asker, times: int, end: str) -> list[float]:
             link.now += PATIENCE
             assert link.agreement.question(link.now) is None
         else:
-            # What it claims is not what it tells.
+            # Its answer contradicts its claim.
             sequence = link.peers["a"].claim(link.now).sequence
             link.agreement.answered("a", Claim(question.since, sequence, 1), False, link.now)
             link.say("a", heard=False)

@@ -92,7 +92,7 @@ class SendReport:
     Attributes
     ----------
     messages, samples : int
-        What was handed to the network.
+        The messages and samples that were handed to the network.
     not_sent : Counter
         Samples and removals that no message can hold, by reason.
     """
@@ -151,7 +151,7 @@ class Carrier(Protocol):
         Raises
         ------
         OSError
-            If there is no connection. Whatever it raises, also when it is cancelled, the link calls `close` next.
+            If there is no connection. After any error, also when cancelled, the link calls `close` next.
         """
 
     def send(self, turn: Turn) -> None:
@@ -216,7 +216,7 @@ class ReceiveQueue:
     ----------
     capacity : int
         How many moving items may be pending, within 64 MiB for all items together; beyond that the oldest moving items
-        are dropped, and when there are none, the oldest of the others. What is to be read first is dropped last.
+        are dropped, and when there are none, the oldest of the others. The items that are read first are dropped last.
     """
 
     def __init__(self, capacity: int) -> None:

@@ -1,8 +1,8 @@
 """Lookups in the buffers of other processes: a link asks, and a `BufferServer` of another link answers.
 
-A question goes to one peer of the robot that serves a buffer; its signs of life say so. It waits there as any lookup
-of that buffer does, for `LONGEST_WAIT` at most; then the asker is told what is missing, and asks again if it still
-wants to know. One that is given up is cancelled there. What comes from strangers passes `tfbus.links.remote_lookup`.
+A question goes to one peer of the robot that serves a buffer; its signs of life say so. It waits there as any lookup of
+that buffer does, for `LONGEST_WAIT` at most; then the asker is told what is missing, and asks again if it still wants
+to know. A question that is given up is cancelled there. `tfbus.links.remote_lookup` checks the bytes of strangers.
 """
 
 import logging

@@ -23,7 +23,7 @@ class Peer:
     robot : str
         The robot whose link it is; empty without one.
     number : int
-        That of its newest live message; 0 before the first.
+        The number of its newest live message; 0 before the first.
     authorities : set of str
         The authorities whose samples it has sent.
     authority_text : int

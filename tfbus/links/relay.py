@@ -55,7 +55,7 @@ class Provenance:
     sequence : int
         Its number on that bus; later ones have higher numbers.
     outbox : Outbox or None
-        That of the link that brought it: what came in there does not go out there. None for this bus's own.
+        The outbox of the link that brought it, which does not send it back. None for this bus's own.
     peer : Peer or None
         The other end of that link; None for this bus's own.
     """
