@@ -38,6 +38,7 @@
 enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quaternion x, y, z, w */
 #define ROW_SIZE (WIDTH * sizeof(double))
 #define SAMPLE_SIZE (sizeof(int64_t) + ROW_SIZE)
+#define ROUNDING 1e-15 /* as in tfbus.rows */
 #define EXACT_GAP ((uint64_t)1 << 53) /* ns; a greater difference of stamps is inexact as a float, and Python divides */
 
 static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
@@ -2471,14 +2472,17 @@ judge_accepts(Judge *self, PyObject *batch)
         }
     }
     const int plain = judged == size;
+    const int64_t earliest = self->earliest;
+    long long behind = 0;
     for (Py_ssize_t i = 0; plain && i < size; i++) {
         const int64_t stamp = ((const Sample *)PyTuple_GetItem(batch, i))->stamp;
         if (!edges[i]->has_newest || stamp > edges[i]->newest) {
             edges[i]->newest = stamp;
             edges[i]->has_newest = 1;
         }
-        self->behind += stamp < self->earliest;
+        behind += stamp < earliest;
     }
+    self->behind += behind;
     if (edges != few) {
         PyMem_Free(edges);
     }
@@ -2994,11 +2998,10 @@ intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
     Trouble trouble = {NULL};
     /* After an error of one buffer, the others get the batch too, because the bus has judged it. */
     for (Py_ssize_t i = 0; i < count; i++) {
-        PyObject *pair = PyTuple_GetItem(feeds, i), *feed, *insert;
-        PyObject *done = PyArg_ParseTuple(pair, "O!O", FeedType, &feed, &insert) ? feed_insert((Feed *)feed, batch) : NULL;
+        PyObject *pair = PyTuple_GetItem(feeds, i), *done = feed_insert((Feed *)PyTuple_GetItem(pair, 0), batch);
         if (done == Py_False) {
             Py_DECREF(done);
-            done = PyObject_CallFunctionObjArgs(insert, batch, NULL);
+            done = PyObject_CallFunctionObjArgs(PyTuple_GetItem(pair, 1), batch, NULL);
         }
         if (done == NULL) {
             set_aside(&trouble);
@@ -3024,8 +3027,17 @@ intake_feeds(Intake *self, void *Py_UNUSED(closure))
 static int
 intake_set_feeds(Intake *self, PyObject *value, void *Py_UNUSED(closure))
 {
-    if (value == NULL || !PyTuple_CheckExact(value)) {
-        PyErr_SetString(PyExc_TypeError, "feeds must be a tuple");
+    Py_ssize_t pairs = 0;
+    const Py_ssize_t size = value != NULL && PyTuple_CheckExact(value) ? PyTuple_Size(value) : -1;
+    for (; pairs < size; pairs++) {
+        PyObject *pair = PyTuple_GetItem(value, pairs);
+        if (!PyTuple_CheckExact(pair) || PyTuple_Size(pair) != 2
+            || !PyObject_TypeCheck(PyTuple_GetItem(pair, 0), FeedType)) {
+            break;
+        }
+    }
+    if (pairs != size) {
+        PyErr_SetString(PyExc_TypeError, "feeds must be a tuple of pairs of a Feed and a callable");
         return -1;
     }
     PyObject *old = self->feeds;
@@ -3072,6 +3084,96 @@ static PyType_Spec intake_spec = {
     "tfbus._kernel.Intake", sizeof(Intake), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC, intake_slots
 };
 
+/* Messages ---------------------------------------------------------------------------------------------------------- */
+
+/* A sample of a message whose names and tag are known; NULL with or without an error if it is not plain. */
+static PyObject *
+decoded_sample(PyTypeObject *kind, PyObject *names, PyObject *tag, int64_t stamp, const char *row)
+{
+    static PyObject *nothing;
+    if (nothing == NULL && (nothing = PyTuple_New(0)) == NULL) {
+        return NULL;
+    }
+    if (!PyTuple_Check(names) || PyTuple_Size(names) != 2 || !PyTuple_Check(tag) || PyTuple_Size(tag) != 2) {
+        return NULL;
+    }
+    PyObject *parent = PyTuple_GetItem(names, 0), *child = PyTuple_GetItem(names, 1);
+    PyObject *authority = PyTuple_GetItem(tag, 0);
+    if (!PyUnicode_CheckExact(parent) || !PyUnicode_CheckExact(child) || !PyUnicode_CheckExact(authority)) {
+        return NULL;
+    }
+    Sample *sample = (Sample *)((newfunc)PyType_GetSlot(kind, Py_tp_new))(kind, nothing, NULL);
+    if (sample == NULL) {
+        return NULL;
+    }
+    sample->parent = Py_NewRef(parent);
+    sample->child = Py_NewRef(child);
+    sample->authority = Py_NewRef(authority);
+    sample->stamp = stamp;
+    memcpy(sample->row, row, ROW_SIZE);
+    sample->is_static = PyTuple_GetItem(tag, 1) == Py_True;
+    return OBJECT(sample);
+}
+
+/* Decode the plain samples at the beginning of a message: little endian, with names that were decoded before. */
+static PyObject *
+decode(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 5 || !PyBytes_Check(args[0]) || !PyTuple_Check(args[2]) || !PyDict_Check(args[3])
+        || !PyType_Check(args[4]) || !PyType_IsSubtype((PyTypeObject *)args[4], SampleType)) {
+        PyErr_SetString(PyExc_TypeError, "decode takes bytes, an offset, tags, known names and a type of samples");
+        return NULL;
+    }
+    const char *body = PyBytes_AsString(args[0]);
+    const int64_t size = PyBytes_Size(args[0]);
+    int64_t at = PyLong_AsLongLong(args[1]);
+    const Py_ssize_t count = PyTuple_Size(args[2]);
+    PyObject *samples = at == -1 && PyErr_Occurred() ? NULL : PyList_New(0);
+    for (Py_ssize_t i = 0; samples != NULL && i < count; i++) {
+        int32_t seconds;
+        uint32_t nanoseconds, length;
+        double row[WIDTH];
+        if (at < 0 || at > size - 12) {
+            break;
+        }
+        memcpy(&seconds, body + at, 4);
+        memcpy(&nanoseconds, body + at + 4, 4);
+        memcpy(&length, body + at + 8, 4);
+        const int64_t middle = (at + 12 + length + 3) & -4;
+        if (middle > size - 4) {
+            break;
+        }
+        memcpy(&length, body + middle, 4);
+        const int64_t end = (middle + 4 + length + 7) & -8;
+        if (end > size - (int64_t)ROW_SIZE) {
+            break;
+        }
+        memcpy(row, body + end, ROW_SIZE);
+        const double off = row[3] * row[3] + row[4] * row[4] + row[5] * row[5] + row[6] * row[6] - 1.0;
+        /* Zero times a number that is not finite is NaN. */
+        if (!(off >= -ROUNDING && off <= ROUNDING) || !((row[0] + row[1] + row[2]) * 0.0 == 0.0)
+            || nanoseconds >= 1000000000) {
+            break;
+        }
+        PyObject *piece = PyBytes_FromStringAndSize(body + at + 8, (Py_ssize_t)(end - at - 8));
+        PyObject *names = piece == NULL ? NULL : PyDict_GetItemWithError(args[3], piece);
+        Py_XDECREF(piece);
+        PyObject *sample = names == NULL ? NULL
+                                         : decoded_sample((PyTypeObject *)args[4], names, PyTuple_GetItem(args[2], i),
+                                                          (int64_t)seconds * 1000000000 + nanoseconds, body + end);
+        if (sample == NULL || PyList_Append(samples, sample) < 0) {
+            Py_XDECREF(sample);
+            if (PyErr_Occurred()) {
+                Py_CLEAR(samples);
+            }
+            break;
+        }
+        Py_DECREF(sample);
+        at = end + (int64_t)ROW_SIZE;
+    }
+    return samples == NULL ? NULL : Py_BuildValue("(NL)", samples, (long long)at);
+}
+
 /* The module -------------------------------------------------------------------------------------------------------- */
 
 static PyObject *
@@ -3106,6 +3208,9 @@ compose_paths(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nar
 static PyMethodDef module_methods[] = {
     {"compose_paths", FAST(compose_paths), METH_FASTCALL,
      PyDoc_STR("compose_paths(rows, origins): make every pose relative to the first one.")},
+    {"decode", FAST(decode), METH_FASTCALL,
+     PyDoc_STR("decode(body, at, tags, names, kind): the samples of a message up to the first that is not plain, and "
+               "its offset.")},
     {"commit", FAST(commit), METH_FASTCALL,
      PyDoc_STR("commit(frames, batch, first): store the samples from `first` to the first that is not plain; its "
                "index.")},

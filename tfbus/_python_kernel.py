@@ -15,13 +15,15 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from math import acos, sin, sqrt
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from tfbus.rows import IDENTITY, Row, compose, invert
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps
+
+SampleT = TypeVar("SampleT", bound="Sample")
 
 
 class Sample:
@@ -650,6 +652,21 @@ class Paths:
                 return False
             self.inserted += 1
         return True
+
+
+def decode(
+    body: bytes,  # noqa: ARG001
+    at: int,
+    tags: tuple[tuple[str, bool], ...],  # noqa: ARG001
+    names: Mapping[bytes, tuple[str, str]],  # noqa: ARG001
+    kind: type[SampleT],  # noqa: ARG001
+) -> tuple[list[SampleT], int]:
+    """The samples of a little endian message from an offset on, up to the first that is not plain, and its offset.
+
+    A sample is plain if its names are known and its numbers need no correction. Here none is: `tfbus.tf_message`
+    decodes them all.
+    """
+    return [], at
 
 
 def commit(frames: Mapping[str, History], batch: Sequence[Sample], first: int) -> int:

@@ -20,6 +20,7 @@ that it is refused with their errors.
 
 import math
 import struct
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice, repeat
 from typing import Any, Final, Generic, NamedTuple, TypeVar, cast, overload
@@ -30,6 +31,7 @@ from tfbus.geometry.transform import Transform
 from tfbus.plain import printable
 from tfbus.rows import NORM_TOLERANCE, ROUNDING, Row
 from tfbus.stamps import SECOND, format_stamp
+from tfbus.which_kernel import decode as decode_plain
 
 MAX_NAME: Final = 1_024
 """The length of the longest accepted frame name, in bytes of UTF-8."""
@@ -277,7 +279,10 @@ def _transforms_of(
     names_of, make = cache.get, cast(Any, kind.__new__)
     samples: list[Any] = []
     errors: list[InvalidTransformError] = []
-    for tag in tags:
+    rest = tuple(tags)
+    if layout is _LITTLE_ENDIAN and sys.byteorder == "little":
+        samples, at = decode_plain(body, at, rest, cache, kind)
+    for tag in rest[len(samples) :]:
         seconds, nanoseconds, length = head(body, at)
         middle = at + 12 + length + 3 & -4
         (length,) = size(body, middle)

@@ -58,6 +58,7 @@ if kernel == "python":
         Sample,
         commit,
         compose_paths,
+        decode,
     )
 
     Feed: Any = None
@@ -76,6 +77,7 @@ else:
         Sample,
         commit,
         compose_paths,
+        decode,
     )
 
 __all__ = [
@@ -91,6 +93,7 @@ __all__ = [
     "Sample",
     "commit",
     "compose_paths",
+    "decode",
     "kernel",
     "plain_first",
 ]

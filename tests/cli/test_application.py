@@ -38,7 +38,6 @@ NEED = "--connect and --listen need one more package:"
 DEFAULTS = {
     "check": "10.0 100000000.0 100.0 100.0 tf",
     "demo": "inf 100.0 1.0",
-    "router": "tcp/127.0.0.1:17447",
     "view": "8080 127.0.0.1 30.0 tf",
 }
 

@@ -591,12 +591,12 @@ class Bus:
     def _well_typed(self, samples: object) -> Batch:
         """The samples in a batch; anything else in it is counted as rejected."""
         things = tuple(samples) if isinstance(samples, Iterable) else (samples,)
-        batch = tuple(thing for thing in things if isinstance(thing, TransformStamped))
-        if len(batch) < len(things):
-            for thing in things:
-                if not isinstance(thing, TransformStamped):
-                    self._topology.reject("not a sample", TypeError(f"expected a TransformStamped, not {thing!r}"))
-        return batch
+        if all(issubclass(kind, TransformStamped) for kind in set(map(type, things))):
+            return things
+        for thing in things:
+            if not isinstance(thing, TransformStamped):
+                self._topology.reject("not a sample", TypeError(f"expected a TransformStamped, not {thing!r}"))
+        return tuple(thing for thing in things if isinstance(thing, TransformStamped))
 
     def _clock_jumped(self, before: int, after: int) -> None:
         self._topology.clock_moved(after)

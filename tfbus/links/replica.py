@@ -3,67 +3,74 @@
 The map
 -------
 Frame -> the *entry* of the highest rank: a sample, static or the newest moving one, or a removal. A rank is the number
-and the origin of the batch or removal (see `tfbus.links.relay`). So of two entries all links keep the same one, in any
-order of arrival: a last-writer-wins map (Shapiro, Preguica, Baquero and Zawirski, "Conflict-free replicated data
-types", 2011). Every link that holds an entry can pass it on, not only its author. The copy also holds entries that its
-bus refuses.
+and the origin of the batch or removal (see `tfbus.links.relay`), so of two entries all links keep the same one, in
+whatever order they come: a last-writer-wins map (Shapiro, Preguica, Baquero and Zawirski, "Conflict-free replicated
+data types", 2011). Whoever holds an entry can give it on, not only its author. What a bus refuses is in its copy all
+the same.
 
-Messages
---------
-Live messages carry samples and removals as they happen. They are numbered, and never repeated. The other messages below
-find and fetch missing entries; kinds and layout are in `tfbus.links.message`.
+What goes over the wire
+-----------------------
+Live messages carry what is published and removed, as it happens. They are numbered, and nothing in them is repeated.
+What they did not bring is found and fetched by the messages below; kinds and layout are in `tfbus.links.message`.
 
 ========  =========  ==========================================================================================
-message   to         content
+message   to         says
 ========  =========  ==========================================================================================
 live      a channel  batches and removals, with the number of the message
 sign      a channel  a sign of life: the number of the newest live message, the sequence and digest of the copy,
                      and which buses are reached by other links
-meeting   one link   a sign, and the frames that the sender itself brings to the domain, unless they are many
-question  one link   a request for the changes of a copy since a sequence (and the frames that the asker wants)
-answer    one link   entries, the sequence up to which they are complete, and whether that is the newest
+meeting   one link   a sign, and what the sender itself brings to the domain, unless that is much
+question  one link   what has changed in your copy since this sequence? (and: these frames are all that I want)
+answer    one link   entries, the sequence up to which they tell all, and whether that is the newest
 ========  =========  ==========================================================================================
 
 Each copy numbers its own changes: its *sequence* (as Syncthing does). An entry is *settled* once it has not changed for
 `SETTLING`; a static sample, a removal, and what an answer has told are settled at once. The digest is over settled
 entries, so a frame that moves many times a second does not make copies differ.
 
-1. If a sign has the digest of the link's own copy, nothing has to be done: the entries up to its sequence are here.
+1. A sign with the digest of one's own copy needs nothing: what that copy holds up to its sequence is here.
    A copy of some frames only is compared over these, once its link has asked for them.
-2. If the digests differ, and the other sequence is beyond the known one of that copy, the link asks a little later, if
-   they still differ. If a number is missing among the live messages, it asks soon, even if the digests agree.
-3. A link asks one question at a time. Answers are bounded; the next question begins where the last answer ended, up to
-   the newest entry. After an answer without news, the next question to that link waits twice as long.
-4. A new link asks the first link that it meets for everything at once.
+2. Where digests differ, and the other sequence is beyond what is known of that copy, the link asks it a little later,
+   if they differ still. A missing number among the live messages is a reason to ask it soon, whatever the digests.
+3. A link that has not read all that has come puts its questions off, for what is missing may be there already; else
+   those that are busy would make each other busier.
+4. There is one question at a time. Answers are bounded, and the next one is asked for behind the last, up to the
+   newest. Answers without news make the next question to that link wait twice as long.
+5. A link that starts asks the first one that it meets for all at once.
 
 So all copies agree some seconds after any trouble, without one digest for each peer and without a leader.
 
 Present, stale, lost
 --------------------
-A link is *present* if the wire has announced it. Its frames are *stale* if no new samples of them come, which their
-ages show; a stopped or busy process is only stale. A link is *lost* if the wire says so: on one machine by the end of
-its socket, over a router by the end of its token. No entry leaves the map then, because others may hear the process, or
-it may come back. A link with ``drop_lost`` removes the frames of a bus from its own bus while no route leads there, and
-restores them from its copy when one does. So both settings agree on the map: without ``drop_lost`` a bus shows the
-newest entry of every frame, for late joiners too; with it, only the frames of reachable buses.
+*Present* is a link that the wire has announced. Its frames are *stale* if nothing new comes of them, which their ages
+tell; a process that is stopped or busy is no more than that. *Lost* is what the wire says is gone: on one machine the
+end of the socket, over a router the end of its token. Nothing leaves the map by that, for others may hear the process,
+or it may come back. A link with ``drop_lost`` takes the frames of a bus off its own bus while no way leads there, and
+puts them back, out of its copy, when one does. So both settings agree on the map, and each bus shows what it was told
+to show: without it the newest of all that was said, for late joiners too; with it only what somebody answers for.
 
-A route may lead over a bus with two links. The signs of such a bus list the buses that it reaches by its other links,
-each with the buses on the route, so that no link takes a route that leads back through itself (a path vector, as in
-BGP, RFC 4271).
+A way may lead over a bus with two links. Such a bus tells in its signs which buses it reaches by its other links, each
+with the buses on the way there, so that nobody takes a way that leads back through itself (a path vector, as in BGP,
+RFC 4271).
 """
 
 import heapq
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from itertools import islice
 from math import inf
 from random import uniform
 from typing import NamedTuple
 
+try:
+    # hashlib has it too, but loads OpenSSL for others, which takes 0.6 MB of each process with a link.
+    from _blake2 import blake2b
+except ImportError:  # A Python that has it elsewhere.
+    from hashlib import blake2b
+
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.hashes import hash_bytes
-from tfbus.links.outbox import OutgoingBatch, Rank, RemovedFrame
+from tfbus.links.relay import OutgoingBatch, Rank, RemovedFrame
 
 SETTLING = 1.5
 """s; a frame that moves less often than that is in the digests between its samples."""
@@ -77,6 +84,8 @@ MOST_REMEMBERED = 1_000
 """So many lost peers are remembered, with what was known of their copies."""
 PATIENCE = 3.0
 """s; so long a link waits for an answer."""
+LONGEST_DELAY = 10.0
+"""s; so long a link that has no time to read puts all its questions off, and then asks one."""
 _LONGEST_PAUSE = 60.0
 _ASK_AGAIN = 30.0
 _SPARE = 1_000
@@ -110,7 +119,7 @@ class Claim(NamedTuple):
     since, sequence : int
         An answer tells all changes behind `since` up to `sequence`.
     digest : int
-        The digest of the copy at `sequence`; 0 if `final` is not set.
+        That of the copy at `sequence`; 0 if `final` is not set.
     final : bool
         Whether `sequence` is the newest.
     partial : bool
@@ -230,6 +239,28 @@ class Replica:
             heapq.heappush(self._removals, (rank, frame))
             if self._too_many_removals or len(self._removals) > 2 * MOST_REMOVALS:
                 self._forget_removals()
+        return True
+
+    def note_moving(self, samples: Sequence[TransformStamped], rank: Rank) -> bool:
+        """Take in live samples of frames that go on moving; returns False at the first that is none.
+
+        It does what `note` does for each, in a third of the time: nearly all samples are of this kind.
+        """
+        number, origin = rank
+        entries, fresh, make = self.entries, self._fresh, tuple.__new__
+        for sample in samples:
+            child = sample.child
+            known = entries.get(child)
+            if (
+                known is None
+                or sample.static
+                or known.origin != origin
+                or known.number >= number
+                or known.sample is None
+            ):
+                return False
+            entries[child] = make(Entry, (number, origin, sample, False))
+            fresh[child] = None
         return True
 
     def claim(self, now: float, frames: Collection[str] | None = None) -> Claim:
@@ -382,6 +413,11 @@ class Replica:
         return entry is not None and entry.sample is None and (entry.number, entry.origin) == rank
 
 
+def hash_bytes(data: bytes, size: int) -> bytes:
+    """The BLAKE2b hash (RFC 7693) of some bytes, the same in every process; `size` is its own, from 1 to 64 bytes."""
+    return blake2b(data, digest_size=size).digest()
+
+
 def _first(logged: tuple[int, str]) -> int:
     return logged[0]
 
@@ -395,7 +431,19 @@ def _told(frame: str, entry: Entry) -> OutgoingBatch | RemovedFrame:
 class _Copy:
     """The copy of one peer, as far as it is known."""
 
-    __slots__ = ("again", "claim", "due", "frames", "fruitless", "missed", "must_ask", "replica", "seen", "silences")
+    __slots__ = (
+        "again",
+        "claim",
+        "due",
+        "frames",
+        "fruitless",
+        "missed",
+        "must_ask",
+        "replica",
+        "seen",
+        "silences",
+        "urgent",
+    )
 
     def __init__(self, replica: Replica, seen: int, must_ask: bool) -> None:
         self.replica = replica
@@ -408,6 +456,8 @@ class _Copy:
         self.seen = seen
         self.claim: Claim | None = None
         self.due = inf
+        # Whether the question is not put off.
+        self.urgent = False
         self.missed = False
         # Answers without news, and questions without an answer, one after the other.
         self.fruitless = 0
@@ -432,6 +482,8 @@ class Agreement:
         self._remembered: dict[str, tuple[Replica, int]] = {}
         self._asked: Question | None = None
         self._patience = _NEVER
+        # One of the questions that were put off is asked then.
+        self._latest = inf
         self._is_new = True
 
     def joined(self, peer: str, replica: Replica, now: float, must_ask: bool = False) -> None:
@@ -440,7 +492,7 @@ class Agreement:
         self._copies[peer] = copy = _Copy(replica, seen if remembered is replica else 0, must_ask)
         if self._is_new or must_ask:
             self._is_new = False
-            copy.due, copy.missed = now, True
+            copy.due, copy.missed, copy.urgent = now, True, True
 
     def filters(self, peer: str, frames: Collection[str]) -> None:
         """The copy of a peer is of these frames only, which are among those of the own copy."""
@@ -476,7 +528,7 @@ class Agreement:
             copy.seen, copy.due, copy.fruitless = claim.sequence, inf, 0
         elif claim.sequence > copy.seen:
             pause = 0.0 if soon else min(uniform(0.3, 0.7) * 2**copy.fruitless, _LONGEST_PAUSE)
-            copy.due = min(copy.due, now + pause)
+            copy.due, copy.urgent = min(copy.due, now + pause), copy.urgent or soon
 
     def missed(self, peer: str, now: float) -> None:
         """Live messages of a peer did not come."""
@@ -496,10 +548,10 @@ class Agreement:
             self._fail(copy, now)
             return
         copy.seen = claim.sequence
-        copy.due = now
+        copy.due, copy.urgent = now, True
         copy.again = now + _ASK_AGAIN if copy.must_ask else inf
         if claim.final:
-            copy.due, copy.missed, copy.claim, copy.silences = inf, False, claim, 0
+            copy.due, copy.urgent, copy.missed, copy.claim, copy.silences = inf, False, False, claim, 0
             copy.fruitless = 0 if news or self._agrees(copy, now) else min(copy.fruitless + 1, 10)
 
     def unanswered(self, peer: str, now: float) -> None:
@@ -510,23 +562,47 @@ class Agreement:
             if copy is not None:
                 self._fail(copy, now)
 
-    def question(self, now: float) -> Question | None:
-        """The question to ask now; None if there is none, or an answer is awaited."""
+    def question(self, now: float, is_behind: bool = False) -> Question | None:
+        """The question to ask now; None if there is none, or an answer is awaited.
+
+        Parameters
+        ----------
+        now : float
+        is_behind : bool
+            Whether the link has not read all that has come.
+        """
         if self._asked is not None:
             if now < self._patience:
                 return None
             self.unanswered(self._asked.peer, now)
+        if is_behind and now < self._latest:
+            self._latest = min(self._latest, now + LONGEST_DELAY)
+            for copy in self._copies.values():
+                if copy.due <= now and not copy.urgent:
+                    copy.due = now + uniform(0.1, 0.2)
         while True:
             peer = min(self._copies, key=self._due_of, default=None)
             if peer is None or self._due_of(peer) > now:
                 return None
             copy = self._copies[peer]
-            again, copy.due = copy.again <= now, inf
-            copy.again = inf
+            again = copy.again <= now
+            copy.due = copy.again = self._latest = inf
+            copy.urgent = False
             if again or copy.missed or not self._agrees(copy, now):
                 self._asked, self._patience = Question(peer, copy.seen), now + PATIENCE
                 return self._asked
             copy.seen = max(copy.seen, 0 if copy.claim is None else copy.claim.sequence)
+
+    def rests(self, peer: str, now: float) -> bool:
+        """Whether nothing is wanted of a peer, so that its last sign would say nothing if it came once more."""
+        copy = self._copies.get(peer)
+        return (
+            copy is not None
+            and copy.due == copy.again == inf
+            and not (copy.missed or copy.silences)
+            and (self._asked is None or self._asked.peer != peer)
+            and self._agrees(copy, now)
+        )
 
     def next_due(self) -> float:
         """The time at which `question` has to be called next."""

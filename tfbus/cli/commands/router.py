@@ -9,12 +9,10 @@ from tfbus.cli.domain import run
 from tfbus.cli.output import say
 from tfbus.errors import pip_install
 
-_ON_THIS_MACHINE = "tcp/127.0.0.1:17447"
-
 
 def router(
     *,
-    listen: tuple[str, ...] = (_ON_THIS_MACHINE,),
+    listen: tuple[str, ...] = (),
     connect: tuple[str, ...] = (),
     backend: Backend = "asyncio",
 ) -> None:
@@ -28,7 +26,8 @@ def router(
     Parameters
     ----------
     listen
-        Listen at this address; may be given several times. Only this machine reaches the default.
+        Listen at this address; may be given several times. By default at port 17447 of the loopback, which only this
+        machine reaches.
     connect
         Connect to another router that listens at this address; may be given several times.
     backend
@@ -36,18 +35,21 @@ def router(
     """
     try:
         from tfbus.links.zenoh import ZenohRouter
+        from tfbus.links.zenoh.zenoh_router import ROUTER
     except ImportError:
         raise UsageError(f"a router needs one more package: {pip_install('cli,zenoh')}") from None
 
+    addresses = listen or (ROUTER,)
+
     async def route() -> None:
         try:
-            async with ZenohRouter(listen, connect=connect):
+            async with ZenohRouter(addresses, connect=connect):
                 onward = f", and on to {' and '.join(connect)}" if connect else ""
-                say(f"routing at {' and '.join(listen)}{onward}, until Ctrl-C")
+                say(f"routing at {' and '.join(addresses)}{onward}, until Ctrl-C")
                 await anyio.sleep_forever()
         except OSError as error:
             why = os.strerror(error.errno) if error.errno else error
-            raise UsageError(f"cannot listen at {' or '.join(listen)}: {why}") from None
+            raise UsageError(f"cannot listen at {' or '.join(addresses)}: {why}") from None
         except ValueError as error:
             raise UsageError(str(error)) from None
 
