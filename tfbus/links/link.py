@@ -56,7 +56,7 @@ class ReceiveQueue:
     ----------
     capacity : int
         How many moving items may be pending, within 64 MiB for all items together; beyond that the oldest moving items
-        are dropped, and when there are none, the oldest of the others. What is to be read first is dropped last.
+        are dropped, and when there are none, the oldest of the others. The items that are read first are dropped last.
     """
 
     def __init__(self, capacity: int) -> None:
