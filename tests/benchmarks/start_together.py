@@ -27,7 +27,7 @@ FRAMES, RATE = 20, 20.0
 
 
 class Facts(NamedTuple):
-    """What one process found."""
+    """The findings of one process."""
 
     met: float
     """Seconds from the last start until it had all static frames; infinite if it never had."""

@@ -356,7 +356,7 @@ def test_a_place_becomes_a_link(
 
 @pytest.mark.parametrize(
     ("place", "why"),
-    [("tf", "no place of ROS: write dds"), ("dds:x", "no place"), ("dds:300", "0 to 232"), ("ws://", "no URL")],
+    [("tf", "not a place of ROS: write dds"), ("dds:x", "not a place"), ("dds:300", "0 to 232"), ("ws://", "no URL")],
 )
 def test_what_is_no_place_of_ros_is_a_usage_error(place: str, why: str) -> None:
     for extra in ("cyclonedds", "wsproto"):

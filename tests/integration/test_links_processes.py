@@ -135,7 +135,7 @@ def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_late_
     together = (listener, late, restarted)
     for process in together:
         process.ask("until", x=kept, lacks=[name for name in ("lidar", "camera", "base") if name not in kept])
-    # What the next one brings is newer, for everybody.
+    # The samples of the next process are newer, on every bus.
     again = processes.add(place.other(drop_lost=drop_lost), backend="trio")
     again.ask("until", x=kept)
     again.ask("statics", names=["lidar"], x=2.0)

@@ -111,7 +111,7 @@ async def test_a_ring_of_local_links_dds_and_a_router_hears_each_sample_once_and
         await until(lambda: all("lidar" in latched(bus) for bus in buses))
         everything = Counter({(child, stamp): 1 for child in ("first", "second", "third") for stamp in range(STAMPS)})
         await until(lambda: all(counter.total() >= everything.total() for counter in heard))
-        # What still goes round arrives before a sign of life of each link.
+        # Samples that still go round arrive before a sign of life of each link.
         await anyio.sleep(2.5)
         assert heard == [everything] * 3
         # DDS tells its writer instead, and may be the faster way.

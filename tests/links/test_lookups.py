@@ -130,7 +130,7 @@ async def test_each_error_is_that_of_the_other_buffer_with_its_facts() -> None:
         with pytest.raises(TypeError, match="fixed"):
             await scene.lookup("map", "base", source_at=3)
         assert scene.counts == {"failed": 5}
-        # What makes no sense is refused before anybody is asked.
+        # An invalid question is refused before any peer is asked.
         for error, options in (
             (TypeError, {"at": 1.5}),
             (ValueError, {"timeout": -1.0}),

@@ -112,7 +112,7 @@ def run(authority: int, is_static: int, samples: int) -> bytes:
     return struct.pack("<HHI", authority, is_static, samples)
 
 
-# What is written is read
+# Written messages are read back
 
 
 removals = st.builds(RemovedFrame, st.sampled_from((ONE, OTHER)), NUMBERS, some.frame_names())

@@ -48,7 +48,7 @@ def test_urgent_items_overtake_what_waits_of_others(waiting: int) -> None:
     for item in (moving(-1), kept(False), JOINED, urgent("question"), urgent("answer", follows=True), LEFT, moving(-2)):
         queue.put(item)
     assert len(queue) == waiting + 7
-    # What the peer sent before its answer is read before that, if that is not much.
+    # Messages that the peer sent before its answer are read before it, if they are not many.
     first = [*hurried[:2], *own, *hurried[2:]] if waiting < MANY else [*hurried[:3], *own, *hurried[3:]]
     assert drained(queue) == [*first, *before, -2]
 
@@ -79,7 +79,7 @@ def test_the_end_of_a_peer_comes_after_its_messages_and_before_it_joins_again() 
     for item in (*map(moving, range(3)), LEFT, moving(-1), JOINED):
         queue.put(item)
     assert drained(queue) == [*range(3), Presence.LEFT, Presence.JOINED, -1]
-    # What waits of others does not hold it up.
+    # Waiting messages of others do not delay it.
     others = [Received("other", number, moving=True) for number in range(4)]
     for item in (*others[:2], moving("last"), *others[2:], LEFT, JOINED):
         queue.put(item)

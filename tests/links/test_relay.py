@@ -181,7 +181,7 @@ def test_a_program_that_starts_again_is_right_against_what_it_has_said_before() 
         assert [process.frames[name].transform.translation[0] for name in ("camera", "lidar")] == [2.0, 2.0]
 
 
-# Who is lost
+# Lost peers
 
 
 def losses(process: Process) -> list[tuple[tuple[str, ...], tuple[str, ...]]]:
@@ -384,7 +384,7 @@ def test_a_quaternion_that_is_a_little_off_is_normalised_once_and_then_copied_as
     assert all(bits(share(twin)) == bits(twin) for share in SHARED)
 
 
-# What passed over a bus beside worlds without origins
+# Samples that passed over a bus beside worlds without origins
 
 
 def passed(*samples: TransformStamped, per_child: int = 3, gone_children: int = 2) -> PassedSamples:

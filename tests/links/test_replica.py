@@ -93,7 +93,7 @@ def test_copies_forget_the_same_removals_in_whatever_order_they_come() -> None:
     assert told == expected
 
 
-# Whom to ask, and when
+# The next question
 
 
 class Asker:
@@ -208,7 +208,7 @@ def pauses(link: Asker, times: int, end: str) -> list[float]:
             link.now += PATIENCE
             assert link.agreement.question(link.now) is None
         else:
-            # What it claims is not what it tells.
+            # Its answer contradicts its claim.
             sequence = link.peers["a"].claim(link.now).sequence
             link.agreement.answered("a", Claim(question.since, sequence, 1), False, link.now)
             link.say("a", heard=False)

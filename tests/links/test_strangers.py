@@ -68,7 +68,7 @@ class Scene:
         return self.process.end.samples, self.process.end.duplicates
 
 
-# What holds of what is said of a frame
+# The entry of a frame that counts
 
 SAID = {"s": static, "m": lambda parent, child, x: moving(parent, child, int(x), x)}
 Step = tuple[str, int, bytes]
@@ -216,7 +216,7 @@ def test_whoever_misses_a_message_asks_soon() -> None:
     assert len(scene.stranger.heard(Kind.QUESTION)) == 1
 
 
-# What is refused
+# Refused samples
 
 
 def test_what_no_message_can_say_is_counted_and_told_once_for_each_peer_and_reason(
@@ -260,7 +260,7 @@ def test_invalid_samples_are_counted_by_reason_and_the_rest_of_their_batch_is_pu
         )
     assert scene.process.seen == samples[:1]
     assert scene.rejected == {"not finite": 2, "self transform": 2}
-    # What only the bus can judge, it refuses.
+    # The bus refuses samples that only it can judge.
     scene = Scene()
     scene.say(static("a", "b"), static("b", "c"), number=1)
     scene.say(static("c", "a"), static("a", "d"), number=2)
@@ -331,7 +331,7 @@ def test_nothing_is_taken_of_a_link_that_was_not_announced_or_has_gone() -> None
     assert (scene.frames, scene.rejected) == (set(), {})
 
 
-# What subscribers do
+# Subscribers
 
 
 def test_a_subscriber_that_raises_hears_all_the_same_and_one_that_closes_the_bus_ends_a_message() -> None:

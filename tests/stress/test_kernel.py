@@ -80,7 +80,7 @@ def test_nothing_that_a_user_can_do_leaks_memory_or_references(monkeypatch: pyte
     async def grown() -> int:
         """The bytes that a hundred calls leave behind, whenever they are made: the least of several times.
 
-        What CPython keeps for reuse is replaced by memory that is traced, ever less of it.
+        CPython's free lists are replaced by traced memory, so they shrink with each run.
         """
         sizes = []
         for _ in range(10):

@@ -110,7 +110,7 @@ async def meet(link: RosLink, bus: Bus, *nodes: AbstractContextManager[Node]) ->
                 await buffer.lookup("odom", "tool", timeout=20.0)
                 laser = await buffer.lookup("base", "laser", timeout=20.0)
                 assert laser.transform.translation == (0.5, 0.0, 0.0)
-                # What waited for the other side is late.
+                # Samples that waited for the other side are late.
                 program.latencies.clear()
                 # The nodes end first, and nobody answers then.
                 with anyio.move_on_after(SECONDS - 4.0):

@@ -62,7 +62,7 @@ class Member:
             if kind == "removal":
                 self.shown.pop(name, None)
                 if drop_lost:
-                    # What was taken off the bus may be put back.
+                    # A link may put removed frames back on the bus.
                     self._ever = {each for each in self._ever if each[0] != name}
             elif kind == "joined":
                 assert name not in self.present

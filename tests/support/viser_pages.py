@@ -135,7 +135,7 @@ class PageClient:
         try:
             return bool(condition())
         except KeyError:
-            # What it asks about has not come yet.
+            # The item of the condition has not come yet.
             return False
 
     def _take(self, window: Any) -> None:

@@ -1,9 +1,9 @@
-"""The channels of a link: all that it publishes, the parts of it for peers with a filter, and the newest samples.
+"""The channels of a link: one for everything, one for each filter of a peer, and one for the newest samples.
 
-A channel numbers its live messages 1, 2, 3, so that each peer, which hears one channel, notices gaps. On ``all`` goes
-everything. A filter is a set of frames that some peer has asked for; its channel has the name of the filter, and on it
-goes what is published and removed of its frames. On ``slow`` goes the newest sample of each moving frame, now and then;
-its messages have no numbers. What nobody hears is not written, but numbered.
+A channel numbers its live messages 1, 2, 3, so that each peer, which hears one channel, notices gaps. ``all`` carries
+everything. A filter is a set of frames that some peer has asked for; its channel has the name of the filter, and
+carries the samples and removals of its frames. ``slow`` carries the newest sample of each moving frame, at the slow
+rate; its messages have no numbers. A message for a channel without listeners is numbered, but not written.
 """
 
 from collections.abc import Collection, Iterable, Sequence

@@ -250,7 +250,7 @@ class DomainEnd(Endpoint):
     def _split_sign(self, item: Received) -> Iterator[Any]:
         for part in read_message(item.content):
             yield part
-            # Who tells the time may be followed later.
+            # Only a sign without a time may rest, because a clock may be followed later.
             if isinstance(part, Heard) and part.time is None and self._agreement.rests(item.sender, self._now()):
                 self._resting[item.sender] = item.content
 

@@ -30,7 +30,7 @@ try:
     from foxglove.messages import FrameTransform, FrameTransforms, Quaternion, Timestamp, Vector3
     from foxglove.websocket import ChannelView, Client, ServerListener, WebSocketServer
 except ImportError as error:
-    raise ImportError(f"to serve Foxglove, tfbus needs a package more: {pip_install('foxglove')} ({error})") from error
+    raise ImportError(f"serving Foxglove needs one more package: {pip_install('foxglove')} ({error})") from error
 
 APPLICATION = ("https://app.foxglove.dev", "https://studio.foxglove.dev", "file://")
 """The origins of the Foxglove application: in a browser, and on the desktop."""
@@ -64,7 +64,8 @@ class FoxgloveServer:
     Attributes
     ----------
     address : str
-        What to enter in Foxglove under *Open connection*: ``ws://127.0.0.1:8765``; empty outside of the ``async with``.
+        The address to enter in Foxglove under *Open connection*: ``ws://127.0.0.1:8765``; empty outside of the ``async
+        with``.
     sent : int
         Samples that were sent to the applications that had subscribed.
     not_sent : int

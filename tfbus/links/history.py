@@ -1,8 +1,8 @@
 """The last seconds of moving frames, for a link that joins late and wants to look back.
 
-It asks each peer once, in chunks of whole frames in the order of their names. What the peer sends live meanwhile waits,
-so that the samples of each frame come in order. The answers have the number of the newest sample of each frame, so what
-was both told and sent live is news only once.
+It asks each peer once, in chunks of whole frames in the order of their names. Live messages of the peer wait meanwhile,
+so that the samples of each frame come in order. The answers have the number of the newest sample of each frame, so a
+sample that comes both live and in an answer is published once.
 """
 
 from bisect import bisect_right
@@ -41,7 +41,7 @@ class HistoryTeller:
     ----------
     bus : Bus
     relay : Relay
-        That of the bus.
+        The relay of the bus.
     replica : Replica
         The link's copy of what it brings.
     """

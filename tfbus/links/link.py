@@ -56,7 +56,7 @@ class ReceiveQueue:
     ----------
     capacity : int
         How many moving items may be pending, within 64 MiB for all items together; beyond that the oldest moving items
-        are dropped, and when there are none, the oldest of the others. What is to be read first is dropped last.
+        are dropped, and when there are none, the oldest of the others. The items that are read first are dropped last.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -190,8 +190,8 @@ class ClockFollower:
 class Link:
     """Joins a bus to other buses, or to another world: ``async with link``.
 
-    What is published in one turn of the event loop goes out together at its end. What comes in waits in a bounded queue
-    and is published on the event loop, 1 ms a turn. A large message takes several.
+    The samples that are published in one turn of the event loop are sent together at its end. Received messages wait in
+    a bounded queue, and the event loop publishes them, 1 ms a turn. A large message takes several turns.
 
     Parameters
     ----------
@@ -442,11 +442,11 @@ class DomainLink(Link):
     robot : str, optional
         The robot whose frames this link brings: letters, digits, ``-``, ``_`` and ``.``.
     robots : iterable of str, or mapping of str to float, optional
-        Hear only the links of these robots; ``*`` in a name stands for any letters. What others send never leaves their
-        processes for this link, and they are no peers of it. By default, it hears all, with and without a robot. A
-        mapping gives a rate in Hz for each: of a robot with a finite rate come the static frames and the newest sample
-        of each moving one, at most so often, and no more often than its links send that, by their `slow_rate`;
-        `math.inf` is for everything, and 0 for nothing but answers to lookups.
+        Hear only the links of these robots; ``*`` in a name stands for any letters. Other links send nothing to this
+        link, and are no peers of it. By default, it hears all links, with and without a robot. A mapping gives a rate
+        in Hz for each: a robot with a finite rate sends its static frames and the newest sample of each moving frame,
+        at most at this rate and at the `slow_rate` of its links. `math.inf` is for everything, and 0 for nothing but
+        answers to lookups.
     slow_rate : float
         How often this link sends the newest sample of each moving frame to those that asked for less than all, in Hz.
     frames : iterable of str, optional

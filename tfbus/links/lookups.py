@@ -2,7 +2,7 @@
 
 A question goes to one peer of the robot that serves a buffer; its signs of life say so. It waits there as any lookup
 of that buffer does, for `LONGEST_WAIT` at most; then the asker is told what is missing, and asks again if it still
-wants to know. One that is given up is cancelled there. What comes from strangers passes `tfbus.links.message`.
+wants to know. A question that is given up is cancelled there. `tfbus.links.message` checks the bytes of strangers.
 """
 
 import logging

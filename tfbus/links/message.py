@@ -124,7 +124,7 @@ class Outgoing:
     bus : bytes
         The sender's own bus.
     number : int
-        That of a live message on its channel, or of the newest one before a sign; 0 for others.
+        The number of a live message on its channel, or of the newest live message before a sign; 0 for others.
     claim : Claim
     time : int or None
     reach : sequence of Way

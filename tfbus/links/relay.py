@@ -14,7 +14,7 @@ Batches of a world that has no origins, such as ROS, get this bus as their origi
 sent, by another link of this bus or by another bus, and nothing in it tells. So while a link to such a world is
 attached, the relay remembers the newest samples of each child, and takes the same one for news only once.
 
-What goes out gathers in the outbox of each link until the turn of the event loop ends.
+Outgoing samples gather in the outbox of each link until the turn of the event loop ends.
 
 The relay also counts the ways to each bus, its *reach*: a link with `drop_lost` withdraws the frames of a bus that no
 way leads to any more. They are not removed: see `tfbus.links.replica`.
@@ -217,7 +217,7 @@ class Peer:
     rate : float
         How often its newest samples are wanted, in Hz; infinite for everything, 0 for nothing.
     number : int
-        That of its newest live message; 0 before the first.
+        The number of its newest live message; 0 before the first.
     authorities : set of str
         The authorities whose samples it has sent.
     authority_text : int
@@ -266,7 +266,7 @@ class Provenance:
     sequence : int
         Its number on that bus; later ones have higher numbers.
     outbox : Outbox or None
-        That of the link that brought it: what came in there does not go out there. None for this bus's own.
+        The outbox of the link that brought it, which does not send it back. None for this bus's own.
     peer : Peer or None
         The other end of that link; None for this bus's own.
     """

@@ -3,25 +3,25 @@
 The map
 -------
 Frame -> the *entry* of the highest rank: a sample, static or the newest moving one, or a removal. A rank is the number
-and the origin of the batch or removal (see `tfbus.links.relay`), so of two entries all links keep the same one, in
-whatever order they come: a last-writer-wins map (Shapiro, Preguica, Baquero and Zawirski, "Conflict-free replicated
-data types", 2011). Whoever holds an entry can give it on, not only its author. What a bus refuses is in its copy all
-the same.
+and the origin of the batch or removal (see `tfbus.links.relay`). So of two entries all links keep the same one, in any
+order of arrival: a last-writer-wins map (Shapiro, Preguica, Baquero and Zawirski, "Conflict-free replicated data
+types", 2011). Every link that holds an entry can pass it on, not only its author. The copy also holds entries that its
+bus refuses.
 
-What goes over the wire
------------------------
-Live messages carry what is published and removed, as it happens. They are numbered, and nothing in them is repeated.
-What they did not bring is found and fetched by the messages below; kinds and layout are in `tfbus.links.message`.
+Messages
+--------
+Live messages carry samples and removals as they happen. They are numbered, and never repeated. The other messages below
+find and fetch missing entries; kinds and layout are in `tfbus.links.message`.
 
 ========  =========  ==========================================================================================
-message   to         says
+message   to         content
 ========  =========  ==========================================================================================
 live      a channel  batches and removals, with the number of the message
 sign      a channel  a sign of life: the number of the newest live message, the sequence and digest of the copy,
                      and which buses are reached by other links
-meeting   one link   a sign, and what the sender itself brings to the domain, unless that is much
-question  one link   what has changed in your copy since this sequence? (and: these frames are all that I want)
-answer    one link   entries, the sequence up to which they tell all, and whether that is the newest
+meeting   one link   a sign, and the frames that the sender itself brings to the domain, unless they are many
+question  one link   a request for the changes of a copy since a sequence (and the frames that the asker wants)
+answer    one link   entries, the sequence up to which they are complete, and whether that is the newest
 ========  =========  ==========================================================================================
 
 Each copy numbers its own changes: its *sequence* (as Syncthing does). An entry is *settled* once it has not changed for
@@ -42,16 +42,16 @@ So all copies agree some seconds after any trouble, without one digest for each 
 
 Present, stale, lost
 --------------------
-*Present* is a link that the wire has announced. Its frames are *stale* if nothing new comes of them, which their ages
-tell; a process that is stopped or busy is no more than that. *Lost* is what the wire says is gone: on one machine the
-end of the socket, over a router the end of its token. Nothing leaves the map by that, for others may hear the process,
-or it may come back. A link with ``drop_lost`` takes the frames of a bus off its own bus while no way leads there, and
-puts them back, out of its copy, when one does. So both settings agree on the map, and each bus shows what it was told
-to show: without it the newest of all that was said, for late joiners too; with it only what somebody answers for.
+A link is *present* if the wire has announced it. Its frames are *stale* if no new samples of them come, which their
+ages show; a stopped or busy process is only stale. A link is *lost* if the wire says so: on one machine by the end of
+its socket, over a router by the end of its token. No entry leaves the map then, because others may hear the process, or
+it may come back. A link with ``drop_lost`` removes the frames of a bus from its own bus while no route leads there, and
+restores them from its copy when one does. So both settings agree on the map: without ``drop_lost`` a bus shows the
+newest entry of every frame, for late joiners too; with it, only the frames of reachable buses.
 
-A way may lead over a bus with two links. Such a bus tells in its signs which buses it reaches by its other links, each
-with the buses on the way there, so that nobody takes a way that leads back through itself (a path vector, as in BGP,
-RFC 4271).
+A route may lead over a bus with two links. The signs of such a bus list the buses that it reaches by its other links,
+each with the buses on the route, so that no link takes a route that leads back through itself (a path vector, as in
+BGP, RFC 4271).
 """
 
 import heapq
@@ -121,7 +121,7 @@ class Claim(NamedTuple):
     since, sequence : int
         An answer tells all changes behind `since` up to `sequence`.
     digest : int
-        That of the copy at `sequence`; 0 if `final` is not set.
+        The digest of the copy at `sequence`; 0 if `final` is not set.
     final : bool
         Whether `sequence` is the newest.
     partial : bool

@@ -100,16 +100,16 @@ class Wire(Protocol):
             Takes the id of a link, and what has come of it: that it has joined or left, a message that it has published
             on a channel which this link hears, or one that it has sent to this link. Messages that are sent to this
             link come from all links of the domain, announced or not. Any thread may call it, from now until `close`
-            has returned and later; it never blocks and never raises. What one link has published comes in its order,
-            and so does what it has sent.
+            has returned and later; it never blocks and never raises. The published messages of one link come in
+            their order, and so do the messages that it has sent to this link.
         warn : callable
             Takes an error of the network that the user should know; for the event loop only. It never raises.
 
         Raises
         ------
         OSError
-            If there can be no network: an address is taken, or a directory is open to others. Whatever it raises, also
-            when it is cancelled, the link calls `close` next.
+            If there can be no network: an address is taken, or a directory is open to others. After any error, also
+            when cancelled, the link calls `close` next.
         """
 
     async def run(self) -> None:
@@ -221,7 +221,7 @@ class SendReport:
     Attributes
     ----------
     messages, samples : int
-        What was handed to the network.
+        The messages and samples that were handed to the network.
     not_sent : Counter
         Samples and removals that no message can hold, by reason.
     """
@@ -280,7 +280,7 @@ class Carrier(Protocol):
         Raises
         ------
         OSError
-            If there is no connection. Whatever it raises, also when it is cancelled, the link calls `close` next.
+            If there is no connection. After any error, also when cancelled, the link calls `close` next.
         """
 
     def send(self, turn: Turn) -> None:

@@ -209,7 +209,7 @@ async def test_the_oldest_published_messages_are_dropped_for_a_link_that_does_no
         while not heard or heard[-1] != 299:
             message = await peer.hear()
             heard.append(-1 if message == b"sent" else struct.unpack_from("<I", message)[0])
-        # What the system and a frame that has been begun hold comes before.
+        # The buffers of the system and a begun frame come before it.
         before = heard.index(-1)
         assert before < 30
         assert heard[:before] == list(range(before))

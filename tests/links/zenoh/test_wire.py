@@ -26,7 +26,7 @@ from tfbus.tf_message import MalformedMessageError
 pytestmark = pytest.mark.anyio
 
 
-# What links say to each other
+# Messages between links
 
 
 @pytest.mark.every_loop

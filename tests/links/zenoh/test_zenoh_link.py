@@ -20,7 +20,7 @@ async def test_without_zenoh_the_import_names_the_extra() -> None:
     program = "import sys; sys.modules['zenoh'] = None; import tfbus.links.zenoh"
     with Program(sys.executable, "-c", program) as done:
         assert done.wait() == 1
-        assert done.errors.text.splitlines()[-1].endswith(f"a package more: {pip_install('zenoh')}")
+        assert done.errors.text.splitlines()[-1].endswith(f"one more package: {pip_install('zenoh')}")
 
 
 async def test_links_that_have_ended_are_freed_with_their_threads(address: str, domain: str) -> None:
@@ -36,7 +36,7 @@ async def test_links_that_have_ended_are_freed_with_their_threads(address: str, 
 
     with Bus() as own:
         async with ZenohRouter(address), ZenohLink(own, domain, connect=address) as stays:
-            # What is made once for all links is there.
+            # The objects that all links share exist now.
             await join_for_a_moment(0)
             threads = threading.active_count()
             for number in range(1, 31):

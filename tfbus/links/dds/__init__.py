@@ -3,7 +3,7 @@
 try:
     import cyclonedds  # noqa: F401 - the inner modules need it
 except ImportError:
-    raise ImportError('a link over DDS needs a package more: pip install "tfbus[dds]"') from None
+    raise ImportError('a link over DDS needs one more package: pip install "tfbus[dds]"') from None
 
 from tfbus.links.dds.dds_link import DdsLink
 

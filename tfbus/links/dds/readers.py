@@ -313,7 +313,7 @@ class Publishers:
         self._bytes = 0
 
     def __len__(self) -> int:
-        """How many publishers and names of publishers are remembered."""
+        """The number of publishers and names of publishers that are remembered."""
         with self._lock:
             return len(self._publishers) + self._named
 

@@ -26,7 +26,7 @@ class LocalLink(DomainLink):
         Use ports of the loopback, with a key in the directory, in place of Unix sockets. By default only where there
         are none, as on Windows; all links of a domain have to use the same.
     **options
-        Those of `tfbus.links.DomainLink`: `robot`, `robots`, `slow_rate`, `frames`, `drop_lost`, `max_frames`,
+        The options of `tfbus.links.DomainLink`: `robot`, `robots`, `slow_rate`, `frames`, `drop_lost`, `max_frames`,
         `capacity`, `history`, `clock` and `tell_clock`.
 
     Raises

@@ -1,7 +1,7 @@
 """`LocalWire`: the wire between the processes of one user on one machine.
 
-Each two links have one connection: a Unix stream socket in a directory that only the user can enter, see
-`tfbus.links.local.meeting_place`. Nobody has to be there first, and no other program takes part.
+Every two links share one connection: a Unix stream socket in a directory that only the user can enter, see
+`tfbus.links.local.meeting_place`. The order of their start does not matter, and no other program takes part.
 
 The protocol
 ------------
@@ -21,8 +21,8 @@ early. The proof is an HMAC of both hellos, whose random numbers make each of th
 empty, and the kernel tells the user of the other process; on the loopback the key stands in the file that names the
 port.
 
-Who connects to whom
---------------------
+Connecting
+----------
 The younger link connects to the older ones, when it opens and whenever the folder of the domain has changed; so two
 links never connect to each other, and one that was missed is met at the next look. A link looks often at first, and
 then once a second, which costs one question to the system while nothing has changed. A younger link that has not
@@ -32,9 +32,9 @@ newer one replaces one that is not met yet.
 
 Present and lost
 ----------------
-The kernel tells who is there. A link has left when its connection has ended, which the others see at once when its
-process is killed, after all that it has written. A process that is stopped or busy is present: its socket fills, then
-what waits for it here is bounded, and it reads all that when it goes on.
+The kernel knows the present links. A link has left when its connection has ended. If its process is killed, the others
+see this at once, after all messages that it has written. A process that is stopped or busy is present: its socket
+fills, then a bounded number of messages waits for it here, and it reads them all when it goes on.
 
 Bounds
 ------

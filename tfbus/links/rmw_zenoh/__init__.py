@@ -3,7 +3,7 @@
 try:
     import zenoh  # noqa: F401 - the inner modules need it
 except ImportError:
-    raise ImportError('a link to rmw_zenoh needs a package more: pip install "tfbus[zenoh]"') from None
+    raise ImportError('a link to rmw_zenoh needs one more package: pip install "tfbus[zenoh]"') from None
 
 from tfbus.links.rmw_zenoh.rmw_zenoh_link import RmwZenohLink
 

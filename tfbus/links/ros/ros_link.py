@@ -1,11 +1,11 @@
 """`RosLink`, the base of all links to ROS, and `RosCarrier`, the half of a carrier that they share.
 
-A carrier decides what goes to which topic, and what comes from there; a subclass connects, publishes and closes. What
-comes is a `RosMessage`: bytes for the link to decode in its turn, in parts if they are many.
+A carrier sorts samples and messages by topic; a subclass connects, publishes and closes. A received message is a
+`RosMessage`: bytes that the link decodes in its turn, in parts if they are many.
 
-A publisher of ROS keeps its last message on ``/tf_static`` for late joiners. So each message that goes there holds all
-static frames that this link sends. ROS has no message that removes a frame: a static one is missing in the next
-message, which late joiners get, and of a moving one nobody is told.
+A publisher of ROS keeps its last message on ``/tf_static`` for late joiners. So each message to that topic holds all
+static frames that this link sends. ROS has no message that removes a frame: a removed static frame is missing in the
+next message, which late joiners get; the removal of a moving frame is not sent.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -5,7 +5,7 @@ try:
     import wsproto  # noqa: F401
 except ImportError as error:
     raise ImportError(
-        f'a link through rosbridge needs some packages more: pip install "tfbus[rosbridge]" ({error})'
+        f'a link through rosbridge needs more packages: pip install "tfbus[rosbridge]" ({error})'
     ) from None
 
 from tfbus.links.rosbridge.rosbridge_link import RosbridgeLink

@@ -5,7 +5,7 @@ from tfbus.errors import pip_install
 try:
     import zenoh  # noqa: F401 - the inner modules need it
 except ImportError:
-    raise ImportError(f"a link over zenoh needs a package more: {pip_install('zenoh')}") from None
+    raise ImportError(f"a link over zenoh needs one more package: {pip_install('zenoh')}") from None
 
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 from tfbus.links.zenoh.zenoh_router import ZenohRouter

@@ -236,7 +236,7 @@ class Keeper:
     Parameters
     ----------
     keep : callable
-        What the thread does. It returns soon after `stopped`; it waits for `changed` meanwhile.
+        The work of the thread. It returns soon after `stopped`; it waits for `changed` meanwhile.
 
     Attributes
     ----------

@@ -3,13 +3,13 @@
 Keys, where *robot* is ``~`` for a link without one, *link* is 32 hexadecimal digits that each link draws at random, and
 *n* counts the sessions of a link from 1::
 
-    tfbus/domain/robot/channel/link     what a link publishes; subscribed by those that hear the channel of the robot
-    tfbus/domain/@to/link               what others send to a link; subscribed by it alone. The attachment is the
-                                        sender's id as 16 bytes
+    tfbus/domain/robot/channel/link     messages of a link; subscribed by links that hear the channel of the robot
+    tfbus/domain/@to/link               messages to a link; subscribed by it alone. The attachment is the sender's
+                                        id as 16 bytes
     tfbus/domain/robot/@alive/link/n    a liveliness token for each session of a link, declared when it hears all
 
-Who dials whom: a link dials a router, the first of its addresses that answers within `OPENING_TIME`. Links never dial
-each other. With ``listen`` a link's own session is a router; it dials the other routers, and never breaks.
+Connecting: a link dials a router, the first of its addresses that answers within `OPENING_TIME`. Links never dial each
+other. With ``listen`` a link's own session is a router; it dials the other routers, and never breaks.
 
 Present: a link is present while the token of its newest known session is seen. A new session of a present link is told
 as `Left` and `Joined`, because messages may have been lost between them. The token of an older session means nothing

@@ -31,7 +31,7 @@ class ZenohLink(DomainLink):
         Seconds of silence after which a router takes this link for lost; 4 s by default. A process that dies is lost at
         once.
     **options
-        Those of `tfbus.links.DomainLink`: `robot`, `robots`, `slow_rate`, `frames`, `drop_lost`, `max_frames`,
+        The options of `tfbus.links.DomainLink`: `robot`, `robots`, `slow_rate`, `frames`, `drop_lost`, `max_frames`,
         `capacity`, `history`, `clock` and `tell_clock`.
 
     Raises
