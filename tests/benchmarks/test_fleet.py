@@ -56,7 +56,6 @@ async def main(options, bare):
 ASKER = """
 async def main(options, count):
     async with link_of(Bus(), options) as client, anyio.create_task_group() as tasks:
-        await client.lookup("map", "base", 0)
         print("ready", flush=True)
         stamp = int(await anyio.to_thread.run_sync(sys.stdin.readline))
         for _ in range(count):
