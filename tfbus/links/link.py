@@ -23,7 +23,7 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.domain import DomainEnd
 from tfbus.links.endpoint import Endpoint, HearsTime
 from tfbus.links.history import LONGEST_HISTORY
-from tfbus.links.lookups import Answers, RemoteLookups
+from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import RemoteQuestion
 from tfbus.links.seams import Presence, Received, Wire
 from tfbus.registration import Registration, warn_unless_entered
@@ -263,7 +263,7 @@ class Link:
     @property
     def peers(self) -> tuple[str, ...]:
         """The ids of the other ends that are there, sorted."""
-        return self._end.peers.present
+        return self._end.present
 
     def __repr__(self) -> str:
         count = len(self.peers)
@@ -274,7 +274,7 @@ class Link:
         """All counters, as they are now."""
         end = self._end
         return LinkStatistics(
-            peers=len(end.peers.present),
+            peers=len(end.present),
             sent_messages=end.report.messages,
             sent_samples=end.report.samples,
             received_messages=end.messages,
@@ -282,7 +282,7 @@ class Link:
             lost=end.lost,
             duplicates=end.duplicates,
             not_sent=dict(end.report.not_sent),
-            rejected=dict(end.peers.rejected),
+            rejected=dict(end.rejected),
             queue=self._receive_queue.statistics(),
         )
 
@@ -538,7 +538,7 @@ class DomainLink(Link):
             raise RuntimeError("the link is not entered")
         return self._domain_end.lookups
 
-    def serve(self, server: Answers | None) -> None:
+    def serve(self, server: BufferServer | None) -> None:
         """Say to all peers whether this link serves a buffer. Called by a `BufferServer`."""
         self._domain_end.serve(server)
 
