@@ -10,7 +10,7 @@ from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
 from tfbus.links.endpoint import MAX_PEERS, Endpoint
-from tfbus.links.history import HistoryAsker, HistoryTeller
+from tfbus.links.history import HistoryAsker, chunk_of_past
 from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import (
     LONGEST_WAY,
@@ -114,13 +114,11 @@ class DomainEnd(Endpoint):
         channels = {inf: self._channel, 0.0: QUIET}
         rates = {"*": inf} if robots is None else robots
         self._rates = {Hearing(pattern, channels.get(rate, SLOW)): rate for pattern, rate in rates.items()}
-        self._channels = Channels(wire, self.relay.origin, self.frames is not None)
-        self._channels.report = self.report
+        self._channels = Channels(wire, self.relay.origin, self.frames is not None, self.report)
         self._places = Places(self.max_frames)
         self._replicas: dict[str, Replica] = {}
         self.own = self._replica_of(robot)
         self._agreement = Agreement()
-        self._history_teller = HistoryTeller(bus, self.relay, self.own)
         self._history = None if history is None else HistoryAsker(history, self._ask_past, now)
         self.lookups = RemoteLookups(wire.send, wire.id, name)
         self._news: dict[str, bool] = {}
@@ -454,7 +452,7 @@ class DomainEnd(Endpoint):
         live: bool,
         past: bool = False,
     ) -> None:
-        if not live and not past and self._history is not None and self._history.waits:
+        if not live and not past and self._history is not None and self._history.open:
             # The newest sample of a moving frame would make its past no news.
             batches = [(source, [sample for sample in samples if sample.static]) for source, samples in batches]
         if self.drop_lost:
@@ -604,7 +602,7 @@ class DomainEnd(Endpoint):
         seconds, after = fields.get("seconds"), fields.get("after")
         if isinstance(seconds, bool) or not isinstance(seconds, (int, float)) or not isinstance(after, str):
             raise MalformedMessageError("text", "a question for the past without a time and a name")
-        entries, final = self._history_teller.chunk(seconds, after)
+        entries, final = chunk_of_past(self.bus, self.relay, self.own, seconds, after)
         out = Outgoing(Kind.PAST, self.relay.origin, 0, Claim(0, 0, 0, final))
         self._wire.send(sender, write_message(out, entries))
 
@@ -612,7 +610,7 @@ class DomainEnd(Endpoint):
         self._wire.send(peer, write_text(Kind.PAST_QUESTION, {"seconds": seconds, "after": after}))
 
     def _take_past(self, peer: Peer, heard: Heard) -> None:
-        if self._history is None or not self._history.is_open(peer.id):
+        if self._history is None or peer.id not in self._history.open:
             return
         goes_on = heard.goes_on
         try:
@@ -631,7 +629,7 @@ class DomainEnd(Endpoint):
     def _end_history(self, peer: str, lost: Peer | None = None) -> None:
         """Publish what waited for the past of a peer, with it or without it; the peer may be lost."""
         known = lost or self.peers.get(peer)
-        if self._history is not None and self._history.is_open(peer):
+        if self._history is not None and peer in self._history.open:
             held = self._history.end(peer)
             if known is not None:
                 # The newest samples that were told meanwhile, if no past has come.
