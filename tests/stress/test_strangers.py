@@ -40,7 +40,7 @@ from tfbus.links.message import (
     write_text,
 )
 from tfbus.links.relay import OutgoingBatch, ReceivedBatch, RemovedFrame
-from tfbus.links.replica import MANY_ORIGINS, MOST_REMOVALS, SETTLING, Claim, Places, Replica, TooManyEntriesError
+from tfbus.links.replica import MANY_ORIGINS, MOST_REMOVALS, Claim, Places, Replica, TooManyEntriesError
 from tfbus.links.seams import Hearing, Joined, Left
 
 pytestmark = pytest.mark.anyio
@@ -388,18 +388,6 @@ async def test_whatever_a_stranger_says_the_others_agree_and_what_is_refused_is_
 
 
 # Defects that were found
-
-
-def test_a_removal_that_is_pushed_out_before_its_frame_has_settled_does_no_harm() -> None:
-    replica = Replica(10, OTHER)
-    replica.note("gone", (1, BUS), moving("map", "gone", 1), settles=True)
-    replica.claim(0.0)
-    replica.note("gone", (2, BUS), None)
-    for number in range(MOST_REMOVALS):
-        replica.note(f"r{number}", (3 + number, BUS), None)
-    replica.claim(SETTLING)
-    assert "gone" not in replica.entries
-    assert len(replica.entries) == MOST_REMOVALS
 
 
 @pytest.mark.thorough

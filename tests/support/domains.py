@@ -181,6 +181,9 @@ class Wire:
     def is_heard(self, channel: str) -> bool:
         return any(other.channel_of(self) == channel for other in self.network.wires if other is not self)
 
+    def is_behind(self) -> bool:
+        return False
+
     def publish(self, channel: str, message: bytes) -> None:
         for other in self.network.wires:
             if other is not self and other.channel_of(self) == channel and self.id in other.met:
@@ -260,9 +263,11 @@ class Host:
         self._end = end
         self._queue = ReceiveQueue(10_000)
         self._handles = False
+        self.received = 0
         end.host = self
 
     def receive(self, item: Received) -> None:
+        self.received += 1
         if self._process.stopped and len(self._queue) >= BACKLOG and isinstance(item.content, bytes):
             return
         self._queue.put(item)
@@ -286,6 +291,9 @@ class Host:
     def send_soon(self, pending: int) -> None:
         del pending
         self._process.sending = True
+
+    def is_behind(self) -> bool:
+        return len(self._queue) > 0
 
     def stir(self) -> None:
         self._process.due = self._process.world.now
@@ -320,6 +328,11 @@ class Process:
         self.removed: list[str] = []
         self._hosts = [Host(self, end) for end in self.ends]
         self.bus.subscribe(self._note, self._note_removal)
+
+    @property
+    def received(self) -> int:
+        """So many items of its networks and worlds had to wait for its event loop."""
+        return sum(host.received for host in self._hosts)
 
     @property
     def end(self) -> DomainEnd:

@@ -29,14 +29,6 @@ class MemoryNetwork:
         for deliver in self.stopped.pop(link):
             deliver()
 
-    def cut_off(self, *links: str) -> None:
-        """Part some links from all others."""
-        inside, outside = set(links), set(self.wires) - set(links)
-        for one, other in [(one, other) for one in inside for other in outside]:
-            self.cut |= {(one, other), (other, one)}
-            self.wires[one].part(other)
-            self.wires[other].part(one)
-
     def heal(self) -> None:
         self.cut.clear()
         for one in self.wires.values():
@@ -111,6 +103,9 @@ class MemoryWire:
 
     def is_heard(self, channel: str) -> bool:
         return any(other.channel_of(self.robot) == channel for other in self._others())
+
+    def is_behind(self) -> bool:
+        return False
 
     def publish(self, channel: str, message: bytes) -> None:
         for other in self._others():

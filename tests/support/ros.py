@@ -67,6 +67,9 @@ class RosEnd:
     def send_soon(self, pending: int) -> None:
         """The test ends the turn."""
 
+    def is_behind(self) -> bool:
+        return False
+
     def stir(self) -> None:
         """Nothing is due."""
 

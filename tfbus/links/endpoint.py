@@ -41,6 +41,9 @@ class Host(Protocol):
     def send_soon(self, pending: int) -> None:
         """Have `Endpoint.send` called at the end of the turn of the event loop; so many samples wait."""
 
+    def is_behind(self) -> bool:
+        """Whether items wait to be handled."""
+
     def stir(self) -> None:
         """Have `Endpoint.work` called before the time that it has returned."""
 

@@ -4,7 +4,7 @@ import math
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from time import monotonic
 from types import TracebackType
 from typing import Any, Final, Self, TypedDict
@@ -204,8 +204,8 @@ class Link:
         time is followed until it is lost; the time of others is refused and counted.
     tell_clock : bool
         Whether to tell peers the time of the bus's clock, which is a `SimulatedClock`.
-    now : callable, optional
-        The monotonic clock, in s, by which a turn ends.
+    budget : TurnBudget, optional
+        The time for which received items keep the event loop.
 
     Attributes
     ----------
@@ -232,7 +232,7 @@ class Link:
         capacity: int = 10_000,
         clock: SimulatedClock | HearsTime | None = None,
         tell_clock: bool = False,
-        now: Callable[[], float] = monotonic,
+        budget: TurnBudget | None = None,
     ) -> None:
         bus = end.bus
         if tell_clock and not isinstance(bus.clock, SimulatedClock):
@@ -251,7 +251,7 @@ class Link:
         # The item that is being handled, and the rest of its parts.
         self._whole: Received | None = None
         self._parts: Iterator[Any] = iter(())
-        self._budget = TurnBudget(now=now)
+        self._budget = TurnBudget() if budget is None else budget
         self._received = LoopWaker(self._handle_received)
         self._turn_ends = LoopWaker(end.send)
         self._entered = False
@@ -347,8 +347,16 @@ class Link:
         """Send what has gathered at the end of this turn of the event loop. Called by the end."""
         if pending >= _FULL_TURN:
             self._end.send()
-        else:
+            return
+        try:
             self._turn_ends.wake()
+        except RuntimeError as error:
+            problem = "the event loop in which it was entered has ended, and not the link"
+            raise RuntimeError(f"{self!r} sends nothing any more: {problem}") from error
+
+    def is_behind(self) -> bool:
+        """Whether items wait to be handled. Called by the end."""
+        return self._whole is not None or len(self._receive_queue) > 0
 
     def stir(self) -> None:
         """Look again what is due. Called by the end."""
@@ -363,6 +371,10 @@ class Link:
                 await self._stirred.wait()
 
     def _handle_received(self) -> None:
+        # The first item takes many times as long as the next ones where other processes have used the caches since the
+        # last turn; with the budget spent on it alone, a crowded machine would never be done.
+        if not (self._attached and self._handle_part()):
+            return
         self._budget.begin()
         while self._attached and self._handle_part():
             if self._budget.spent:

@@ -557,12 +557,11 @@ class Relay:
         passed, foreign = self._passed, origin == self.origin
         settled, removed = self._settled, self._removed
         for sample in samples:
-            fields = sample._fields
-            child = fields[1]
+            child, static = sample.child, sample.static
             # A static one with an origin has to be ranked, so that all buses agree in the end.
-            if passed is not None and (foreign or not fields[5]) and sample in passed:
+            if passed is not None and (foreign or not static) and sample in passed:
                 continue
-            if (child in settled or child in removed or fields[5]) and self._is_outranked(sample, rank):
+            if (child in settled or child in removed or static) and self._is_outranked(sample, rank):
                 continue
             newest = self._newest.get(child)
             known = None if newest is None else newest.get(origin)
@@ -582,7 +581,7 @@ class Relay:
             sample._provenance = provenance
             news.append(sample)
         for sample in news[before:] if before else news:
-            self._newest[sample._fields[1]][origin] = sequence
+            self._newest[sample.child][origin] = sequence
         return refused
 
     def _remove_from_bus(self, frame: str, provenance: Provenance | None) -> None:
@@ -613,12 +612,15 @@ class Relay:
                 provenance = Provenance(self.origin, self._next_number())
             samples = tuple(group)
             for sample in samples:
-                fields = sample._fields
+                child = sample.child
                 if self._passed is not None:
                     self._passed.add(sample)
-                self._latest[fields[1]] = provenance
-                if fields[5]:
-                    self._settled[fields[1]] = provenance.rank
+                latest = self._latest.get(child)
+                # A sample of another bus that is late does not make the frame its own.
+                if latest is None or latest.sequence < provenance.sequence or latest.rank < provenance.rank:
+                    self._latest[child] = provenance
+                if sample.static:
+                    self._settled[child] = provenance.rank
             outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
             for outbox in outboxes:
                 outbox.add_batch(outgoing, echo=outbox is provenance.outbox)

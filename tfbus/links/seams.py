@@ -118,6 +118,10 @@ class Wire(Protocol):
     def is_heard(self, channel: str) -> bool:
         """Whether any link may hear a channel of this one; it does not block and does not raise."""
 
+    def is_behind(self) -> bool:
+        """Whether something has come that was not read yet, as far as the wire knows; it does not block."""
+        return False
+
     def publish(self, channel: str, message: bytes) -> None:
         """Send a message to all links that hear a channel of this one; it does not block and does not raise.
 

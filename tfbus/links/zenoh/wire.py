@@ -44,7 +44,7 @@ import anyio
 import zenoh
 
 from tfbus._aio.loops import LoopWaker
-from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
 from tfbus.links.zenoh.sessions import (
     LONGEST_NAME,
     Addresses,
@@ -77,7 +77,7 @@ _TOKEN = re.compile(
 _DROP, _REMOTE = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE
 
 
-class ZenohWire:
+class ZenohWire(Wire):
     """A `tfbus.links.seams.Wire` over zenoh's routers.
 
     Parameters
