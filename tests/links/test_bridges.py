@@ -96,9 +96,9 @@ def test_refusals_of_foreign_messages_are_counted_and_the_rest_of_a_message_is_p
     place.say()
     place.say(ForeignTransform("/map", "bad", 1, 0.0), ARM)
     world.run(0.1)
-    assert here.foreign_ends[0].peers.rejected == {"empty": 1, "frame name": 1}
+    assert here.foreign_ends[0].rejected == {"empty": 1, "frame name": 1}
     assert here.frames.keys() == {"arm"}
-    assert here.foreign_ends[0].peers.present == ()
+    assert here.foreign_ends[0].present == ()
 
 
 def test_a_bridge_that_ends_says_nothing_more_and_its_frames_stay_or_go() -> None:

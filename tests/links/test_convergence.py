@@ -58,7 +58,7 @@ def check_nothing_invented(world: World) -> None:
     for process in world.processes:
         assert {(sample.child, sample.stamp) for sample in process.seen} <= world.published
         for end in process.ends:
-            assert not end.peers.rejected
+            assert not end.rejected
 
 
 def until_they_agree(world: World, groups: list[list[Process]]) -> None:

@@ -58,7 +58,7 @@ def test_a_link_for_some_frames_sends_and_takes_these_only_and_peers_send_it_no_
     assert counts(some)["base"] == 20
     assert one.frames.keys() == {"arm", "base", "own"}
     assert some.end.messages - before <= 25
-    assert (some.end.lost, some.end.peers.rejected) == (0, {})
+    assert (some.end.lost, some.end.rejected) == (0, {})
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -153,8 +153,8 @@ def test_only_the_robots_that_are_asked_for_are_peers_and_heard() -> None:
     assert some.frames.keys() == {"r1", "r1/base"}
     assert pattern.frames.keys() == {"r1", "r1/base", "r17", "r17/base"}
     assert len(unnamed.frames) == 7
-    assert some.end.peers.present == (robots["r1"].wire.id,)
-    assert len(unnamed.end.peers.present) == 5
+    assert some.end.present == (robots["r1"].wire.id,)
+    assert len(unnamed.end.present) == 5
 
 
 def test_of_a_slow_robot_come_static_frames_at_once_and_the_newest_of_moving_ones_at_its_rate() -> None:
@@ -192,8 +192,8 @@ def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer() -> None:
         robot.say(moving("map", "b", stamp))
         world.run(1.0)
     assert quiet.frames == {}
-    assert quiet.end.peers.present == (robot.wire.id,)
-    assert not quiet.end.peers.rejected
+    assert quiet.end.present == (robot.wire.id,)
+    assert not quiet.end.rejected
 
 
 def test_what_a_link_publishes_goes_to_each_hearer_in_its_own_way() -> None:

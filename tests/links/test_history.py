@@ -49,7 +49,7 @@ def test_who_joins_late_has_the_last_seconds_with_stamps_parents_and_authorities
         assert [sample.transform.translation[0] for sample in base] == list(range(first, 20))
         assert stamps_of(late.seen, "old") == [3]
         assert [sample.child for sample in late.seen if sample.static] == ["lidar"]
-        assert late.end.peers.rejected == {}
+        assert late.end.rejected == {}
 
 
 def test_the_past_is_not_told_as_late_data_and_what_comes_live_is() -> None:
@@ -152,7 +152,7 @@ def test_what_was_held_back_comes_when_the_peer_says_nothing_leaves_or_sends_too
             peer.say(past, kind=Kind.PAST)
         case "garbage":
             peer.say(peer.batch(moving("map", "base", 0), number=2**64 - 1), kind=Kind.PAST)
-            assert late.end.peers.rejected == {"number": 1}
+            assert late.end.rejected == {"number": 1}
         case "loss":
             network.remove(peer)
             world.run(0.01)
@@ -167,7 +167,7 @@ def test_what_was_held_back_comes_when_the_peer_says_nothing_leaves_or_sends_too
         world.run(PATIENCE)
         heard = sorted(sample.stamp for sample in late.seen)
     assert heard == ([0] if end in ("answer", "same again") else []) + expected
-    assert late.end.peers.rejected.keys() <= {"number"}
+    assert late.end.rejected.keys() <= {"number"}
 
 
 def test_it_has_to_be_a_time_that_passes() -> None:

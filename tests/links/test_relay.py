@@ -313,7 +313,7 @@ def test_frames_that_come_and_go_by_the_ten_thousand_leave_little_behind() -> No
     assert peak_of(lambda: come_and_go(99, 100)) < 3_000_000
     assert not one.frames
     assert not two.frames
-    assert two.end.peers.rejected == {}
+    assert two.end.rejected == {}
 
 
 def test_an_ended_link_forgets_and_its_bus_can_go_on_or_close() -> None:
@@ -325,7 +325,7 @@ def test_an_ended_link_forgets_and_its_bus_can_go_on_or_close() -> None:
     one.bus.close()
     two.bus.close()
     world.run(5.0)
-    assert two.end.peers.rejected == {}
+    assert two.end.rejected == {}
 
 
 # Samples that came over a link

@@ -60,7 +60,7 @@ class Scene:
 
     @property
     def rejected(self) -> dict[str, int]:
-        return dict(self.process.end.peers.rejected)
+        return dict(self.process.end.rejected)
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -311,7 +311,7 @@ def test_so_many_peers_are_there_and_the_messages_of_others_are_not_taken() -> N
     scene = Scene()
     others = [Stranger(scene.network, channel="") for _ in range(MAX_PEERS)]
     scene.world.run(0.1)
-    assert len(scene.process.end.peers.present) == MAX_PEERS
+    assert len(scene.process.end.present) == MAX_PEERS
     assert scene.rejected == {"too many peers": 1}
     others[-1].say(others[-1].batch(static("map", "a"), number=scene.first))
     assert scene.frames == set()

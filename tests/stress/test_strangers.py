@@ -12,20 +12,21 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
+from support.domains import Network, World
+from support.domains import Stranger as WrittenLink
 from support.local_links import RawPeer, files_in, framed
 from support.memory_wire import MemoryNetwork
 from support.processes import free_address, new_domain, until
 from support.samples import moving, static
 
-from tfbus import LATEST, Buffer, Bus, PeerRejected
+from tfbus import LATEST, Buffer, Bus, PeerRejected, Transform, TransformStamped
 from tfbus.links import BufferServer, DomainLink
 from tfbus.links.channels import MOST_FILTERS
 from tfbus.links.domain import SOONEST_SIGN
-from tfbus.links.endpoint import MAX_PEERS, MOST_AUTHORITY_TEXT, Peers
+from tfbus.links.endpoint import MAX_PEERS, MOST_AUTHORITY_TEXT
 from tfbus.links.history import MOST_HELD_SAMPLES, HistoryAsker
 from tfbus.links.local import LocalLink
 from tfbus.links.message import (
-    NOTHING,
     Cancellation,
     Entry,
     Heard,
@@ -413,7 +414,7 @@ def test_messages_of_large_batches_do_not_wait_for_the_past_beyond_a_bound() -> 
     asker.joined("one")
     asker.joined("other")
     samples = [moving("map", "arm", stamp) for stamp in range(1_000)]
-    heard = Heard(Kind.LIVE, BUS, 1, NOTHING, None, (), serves=False, entries=[ReceivedBatch(samples, (), BUS, 1)])  # type: ignore[arg-type]
+    heard = Heard(Kind.LIVE, BUS, 1, entries=[ReceivedBatch(samples, (), BUS, 1)])  # type: ignore[arg-type]
     held = sum(asker.holds("one", heard) + asker.holds("other", heard) for _ in range(500))
     assert held == MOST_HELD_SAMPLES // 1_001
     asker.end("one")
@@ -421,14 +422,15 @@ def test_messages_of_large_batches_do_not_wait_for_the_past_beyond_a_bound() -> 
 
 
 def test_the_authorities_of_a_peer_have_so_many_letters_together() -> None:
-    refused: list[str] = []
-    peers = Peers(lambda _, reason, __: refused.append(reason))
-    peer = peers.find("stranger")
-    assert peer is not None
-    admitted = [peers.admit_authorities(peer, (f"{number:x}" * 10_000,), 1) for number in range(200)]
-    assert sum(map(len, peer.authorities)) <= MOST_AUTHORITY_TEXT
-    assert not all(admitted)
-    assert refused == ["too many authorities"]
+    world = World()
+    network = Network(world)
+    process, stranger = world.process(network), WrittenLink(network)
+    for number in range(200):
+        sample = TransformStamped("map", "arm", number, Transform(), f"{number:x}" * 10_000)
+        stranger.say(stranger.batch(sample, number=number + 1))
+    taken = {sample.authority for sample in process.seen}
+    assert sum(map(len, taken)) <= MOST_AUTHORITY_TEXT
+    assert process.end.rejected == {"too many authorities": 200 - len(taken)}
 
 
 async def test_a_link_that_found_no_place_is_met_once_there_is_one() -> None:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from tfbus import InvalidTransformError, Transform, TransformStamped
 from tfbus.links.relay import OutgoingBatch, ReceivedBatch, ReceivedTransform, Turn
-from tfbus.links.seams import Received, ReceivedMessage, SendReport
+from tfbus.links.seams import Carrier, Received, ReceivedMessage, SendReport
 from tfbus.tf_message import MalformedMessageError
 
 
@@ -55,7 +55,7 @@ class ForeignWorld:
         self._nodes.pop(node, None)
 
 
-class ForeignCarrier:
+class ForeignCarrier(Carrier):
     """One node of the world."""
 
     def __init__(self, world: ForeignWorld, node: str = "tfbus") -> None:

@@ -39,6 +39,7 @@ class TurnBudget:
         self._seconds = seconds
         self._now = now
         self._busy = busy
+        self._end = self._busy_end = 0.0
         self.begin()
 
     @property

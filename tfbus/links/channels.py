@@ -22,7 +22,7 @@ from tfbus.links.message import (
     write_message,
 )
 from tfbus.links.relay import OutgoingBatch, RemovedFrame, Turn
-from tfbus.links.replica import Claim, Replica, hash_bytes
+from tfbus.links.replica import Replica, hash_bytes
 from tfbus.links.seams import SendReport, Wire
 
 ALL: Final = "all"
@@ -83,19 +83,20 @@ class Channels:
         The sender's own bus.
     partial : bool
         Whether this link sends and takes some frames only.
+    report : SendReport
     """
 
-    def __init__(self, wire: Wire, bus: bytes, partial: bool) -> None:
+    def __init__(self, wire: Wire, bus: bytes, partial: bool, report: SendReport) -> None:
         self._wire = wire
         self._bus = bus
         self._partial = partial
+        self._report = report
         self._all = _Channel(ALL, None, 0.0)
         self._filters: dict[str, _Channel] = {}
         # The names of filters beyond the bound.
         self._whole: dict[str, None] = {}
         self._newest: dict[str, OutgoingBatch] = {}
         self._time: int | None = None
-        self.report: SendReport
 
     def serve(self, frames: frozenset[str], now: float) -> None:
         """Publish a filter from now on; beyond `MOST_FILTERS` everything goes to those that hear it."""
@@ -184,7 +185,7 @@ class Channels:
     def _write_one(self, channel: _Channel, entries: list[Entry]) -> None:
         """One message of all entries if possible, else several; what cannot be sent is left out and reported."""
         number = 0 if channel.name == SLOW else channel.number + 1
-        out = Outgoing(Kind.LIVE, self._bus, number, Claim(0, 0, 0), self._time)
+        out = Outgoing(Kind.LIVE, self._bus, number, time=self._time)
         try:
             message = write_message(out, entries)
         except ValueError as error:
@@ -195,7 +196,7 @@ class Channels:
             if channel is self._all:
                 for name in self._whole:
                     self._wire.publish(name, message)
-            self.report.sent(sum(map(size_of, entries)))
+            self._report.sent(sum(map(size_of, entries)))
             return
         sendable = [kept for kept in map(self._sendable, entries) if kept is not None]
         if sendable != entries:
@@ -206,7 +207,7 @@ class Channels:
             self._write_one(channel, entries[:middle])
             self._write_one(channel, entries[middle:])
         else:
-            self.report.refused("oversized", failure, size_of(entries[0]))
+            self._report.refused("oversized", failure, size_of(entries[0]))
 
     def _sendable(self, entry: Entry) -> Entry | None:
         """The part of an entry that a message can hold: the entry itself if that is all, None if it is nothing."""
@@ -214,13 +215,13 @@ class Channels:
             try:
                 write_message(Outgoing(Kind.LIVE, self._bus), [entry])
             except ValueError as error:
-                self.report.refused("frame name", error)
+                self._report.refused("frame name", error)
                 return None
             return entry
         errors = list(map(reason_not_to_send, entry.samples))
         if not any(errors):
             return entry
         for refused in filter(None, errors):
-            self.report.refused(refused.reason, refused)
+            self._report.refused(refused.reason, refused)
         kept = tuple(sample for sample, error in zip(entry.samples, errors, strict=True) if error is None)
         return OutgoingBatch(entry.origin, entry.sequence, kept) if kept else None

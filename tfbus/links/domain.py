@@ -1,7 +1,7 @@
 """The end of a link of tfbus, between the relay of its bus and a wire; `tfbus.links.replica` tells the protocol."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from math import inf
 from time import monotonic
 from typing import Any, NamedTuple
@@ -10,8 +10,8 @@ from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
 from tfbus.links.endpoint import MAX_PEERS, Endpoint
-from tfbus.links.history import HistoryAsker, HistoryTeller
-from tfbus.links.lookups import Answers, RemoteLookups
+from tfbus.links.history import HistoryAsker, chunk_of_past
+from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import (
     LONGEST_WAY,
     Heard,
@@ -27,7 +27,6 @@ from tfbus.links.message import (
     write_text,
 )
 from tfbus.links.relay import (
-    Outbox,
     OutgoingBatch,
     Peer,
     Provenance,
@@ -60,58 +59,6 @@ MOST_WAITING = 10_000
 _LARGEST_GAP = 2**32
 _URGENT = frozenset(Kind) - {Kind.LIVE, Kind.SIGN}
 _FOLLOWS = frozenset({Kind.MEETING, Kind.ANSWER, Kind.PAST})
-
-
-class DomainOutbox(Outbox):
-    """The outbox of a link of tfbus; what goes out is noted in the link's copy of the domain.
-
-    Parameters
-    ----------
-    end : DomainEnd
-    """
-
-    keeps_withdrawn = True
-
-    def __init__(self, end: "DomainEnd") -> None:
-        super().__init__(end.frames, end._notify)
-        self._end = end
-
-    def own_sample(self, frame: str, /) -> TransformStamped | None:
-        entry = self._end.own.entries.get(frame)
-        return None if entry is None or entry.origin != self._end.relay.origin else entry.sample
-
-    def ways(self) -> Iterator[Way]:
-        return self._end.ways()
-
-    def reach_changed(self) -> None:
-        self._end.sign_soon()
-
-    def keep(self, entry: OutgoingBatch | RemovedFrame) -> None:
-        own, rank = self._end.own, (entry.sequence, entry.origin)
-        if isinstance(entry, RemovedFrame):
-            if self._frames is None or entry.frame in self._frames:
-                own.note(entry.frame, rank, None, ours=True)
-            return
-        for sample in entry.samples:
-            _, child, _, _, _, static = sample._fields
-            if (self._frames is None or child in self._frames) and can_hold(sample):
-                try:
-                    own.note(child, rank, sample, ours=True, settles=not static)
-                except TooManyEntriesError:
-                    continue
-
-    def kept(self) -> Iterator[OutgoingBatch | RemovedFrame]:
-        return self._end.kept()
-
-    def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
-        if not echo:
-            self.keep(batch)
-        return False
-
-    def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
-        if rank is not None:
-            self._end.own.note(frame, rank, None, ours=True)
-        return False
 
 
 class DomainEnd(Endpoint):
@@ -156,28 +103,25 @@ class DomainEnd(Endpoint):
         history: float | None = None,
         now: Callable[[], float] = monotonic,
     ) -> None:
-        super().__init__(bus, name, frames, drop_lost, max_frames)
+        super().__init__(bus, name, wire, frames, drop_lost, max_frames)
         self._now = now
-        self.id = wire.id
         self._wire = wire
         self._robot = robot
-        self._robots = {"*": inf} if robots is None else robots
         self._slow_period = 1 / slow_rate
         self._channel = ALL if self.frames is None else filter_name(self.frames)
         # Whether peers are to send the wanted frames only.
         self._filters = self._channel != ALL
-        self.outbox = DomainOutbox(self)
-        self._channels = Channels(wire, self.relay.origin, self.frames is not None)
-        self._channels.report = self.report
+        channels = {inf: self._channel, 0.0: QUIET}
+        rates = {"*": inf} if robots is None else robots
+        self._rates = {Hearing(pattern, channels.get(rate, SLOW)): rate for pattern, rate in rates.items()}
+        self._channels = Channels(wire, self.relay.origin, self.frames is not None, self.report)
         self._places = Places(self.max_frames)
         self._replicas: dict[str, Replica] = {}
         self.own = self._replica_of(robot)
         self._agreement = Agreement()
-        self._history_teller = HistoryTeller(bus, self.relay, self.own)
         self._history = None if history is None else HistoryAsker(history, self._ask_past, now)
         self.lookups = RemoteLookups(wire.send, wire.id, name)
         self._news: dict[str, bool] = {}
-        self._thinned: dict[str, float] = {}
         # The last sign of each peer of which nothing is wanted: the same sign once more need not wake the event loop.
         self._resting: dict[str, bytes] = {}
         # Answers take half of the time of the event loop at most.
@@ -192,23 +136,19 @@ class DomainEnd(Endpoint):
     # For the link
 
     async def open(self) -> None:
-        await self._wire.open(self._hearings(), self.take, self._warn_of_wire)
-
-    async def run(self) -> None:
-        await self._wire.run()
-
-    async def close(self) -> None:
-        await self._wire.close()
+        await self._wire.open(list(self._rates), self.take, self._warn_of_wire)
 
     def attach(self) -> None:
-        self.relay.attach(self.outbox)
+        self.relay.attach(self)
         self.lookups.open()
 
     def detach(self) -> None:
         self.lookups.close()
-        for peer in self.peers.forget_all():
+        peers = list(self.peers.values())
+        self.peers.clear()
+        for peer in peers:
             self._forget(peer)
-        self.relay.detach(self.outbox)
+        self.relay.detach(self)
 
     def work(self) -> float:
         now = self._now()
@@ -226,7 +166,7 @@ class DomainEnd(Endpoint):
             if not self._wire.send(question.peer, text):
                 self._agreement.unanswered(question.peer, now)
         if now >= self._sign_due:
-            peers = len(self.peers.present)
+            peers = len(self.present)
             self._sign_period = min(2 * self._sign_period, max(LONGEST_SIGN_PERIOD, LONGEST_SIGN_PERIOD_EACH * peers))
             self._sign(now)
         if self._history is not None:
@@ -264,20 +204,51 @@ class DomainEnd(Endpoint):
         self._hurries = True
         self.host.stir()
 
-    def serve(self, server: Answers | None) -> None:
+    def serve(self, server: BufferServer | None) -> None:
         """Serve a buffer, or none any more."""
         self.lookups.server = server
         self.sign_soon()
 
+    # For the relay
+
+    keeps_withdrawn = True
+
+    def keep(self, entry: OutgoingBatch | RemovedFrame) -> None:
+        rank = entry.sequence, entry.origin
+        if isinstance(entry, RemovedFrame):
+            if self.frames is None or entry.frame in self.frames:
+                self.own.note(entry.frame, rank, None, ours=True)
+            return
+        for sample in entry.samples:
+            _, child, _, _, _, static = sample._fields
+            if (self.frames is None or child in self.frames) and can_hold(sample):
+                with suppress(TooManyEntriesError):
+                    self.own.note(child, rank, sample, ours=True, settles=not static)
+
     def kept(self) -> Iterator[OutgoingBatch | RemovedFrame]:
-        """All that the copies hold."""
         for replica in self._replicas.values():
             yield from replica.told()
 
+    def own_sample(self, frame: str, /) -> TransformStamped | None:
+        entry = self.own.entries.get(frame)
+        return None if entry is None or entry.origin != self.relay.origin else entry.sample
+
     def ways(self) -> Iterator[Way]:
-        """The buses that the peers lead to, each with the buses on the way there."""
-        for peer in self.peers:
+        for peer in self.peers.values():
             yield from peer.paths.items()
+
+    def reach_changed(self) -> None:
+        self.sign_soon()
+
+    def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
+        if not echo:
+            self.keep(batch)
+        return False
+
+    def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
+        if rank is not None:
+            self.own.note(frame, rank, None, ours=True)
+        return False
 
     # Going out
 
@@ -301,14 +272,14 @@ class DomainEnd(Endpoint):
         self._channels.sign(self.own, now, self._reach(), self._serves)
 
     def _reach(self) -> list[Way]:
-        besides = self.relay.reach_besides(self.outbox)
+        besides = self.relay.reach_besides(self)
         return [(origin, path) for origin, path in besides.items() if len(path) < LONGEST_WAY][:255]
 
     def _meet(self, peer: Peer) -> None:
         """Tell a new peer what this link brings, or that it is much."""
         self.send()
         claim = self.own.claim(self._now())._replace(partial=self.frames is not None)
-        out = Outgoing(Kind.MEETING, self.relay.origin, 0, claim, self.outbox.time, self._reach(), self._serves)
+        out = Outgoing(Kind.MEETING, self.relay.origin, 0, claim, self.time, self._reach(), self._serves)
         entries: Sequence[OutgoingBatch | RemovedFrame] = self.own.ours(CHUNK) or ()
         try:
             message = write_message(out, entries)
@@ -336,7 +307,7 @@ class DomainEnd(Endpoint):
         if isinstance(content, Joined):
             peer = self._join(sender, content.robot)
             if peer is not None:
-                peer.rate = self._rate_of(peer.robot)
+                peer.rate = next((rate for one, rate in self._rates.items() if one.matches(peer.robot)), inf)
                 self._meet(peer)
                 self._sign_sooner()
                 # Nothing is wanted of a robot of rate 0 but answers to lookups.
@@ -346,7 +317,7 @@ class DomainEnd(Endpoint):
                     if self._history is not None:
                         self._history.joined(sender)
                 self.host.stir()
-            elif self.peers.get(sender) is None and len(self._waiting) < MOST_WAITING:
+            elif sender not in self.peers and len(self._waiting) < MOST_WAITING:
                 self._waiting[sender] = content
         elif isinstance(content, _Due):
             self._answer_due(sender, content)
@@ -424,7 +395,7 @@ class DomainEnd(Endpoint):
     def _take_entries(self, peer: Peer, heard: Heard, live: bool) -> bool:
         """Note and publish the entries of a message; returns whether any of them was new to the copy."""
         for error in heard.errors:
-            self.peers.reject(peer.id, error.reason, error)
+            self.reject(peer.id, error.reason, error)
         replica = self._replica_of(peer.robot)
         news = False
         together: list[tuple[Provenance, list[ReceivedTransform]]] = []
@@ -436,9 +407,9 @@ class DomainEnd(Endpoint):
                     continue
                 # An answer may tell of buses that the peer does not lead to; they are not the peer's.
                 others = entry.origin not in peer.paths
-                if not others and not self.peers.admit_authorities(peer, entry.authorities, size):
+                if not others and not self._admit_authorities(peer, entry.authorities, size):
                     continue
-                provenance = Provenance(entry.origin, entry.sequence, self.outbox, peer)
+                provenance = Provenance(entry.origin, entry.sequence, self, peer)
                 samples = self._note(replica, provenance, entry.samples, live)
                 news = news or (bool(samples) and not live)
                 together.append((provenance, samples))
@@ -470,7 +441,7 @@ class DomainEnd(Endpoint):
                 is_new = replica.note(child, rank, sample, settles=live and not static)
             except TooManyEntriesError as error:
                 assert peer is not None
-                self.peers.reject(peer.id, "too many frames", error)
+                self.reject(peer.id, "too many frames", error)
                 continue
             if is_new or (live and not static and self._may_be_news(replica.entries[child], provenance.origin)):
                 kept.append(sample)
@@ -493,7 +464,7 @@ class DomainEnd(Endpoint):
             return False
         if not self._admit_number(peer, removal.sequence, 1):
             return False
-        provenance = Provenance(removal.origin, removal.sequence, self.outbox, peer)
+        provenance = Provenance(removal.origin, removal.sequence, self, peer)
         is_own = removal.origin == self.relay.origin
         is_new = not is_own and replica.note(removal.frame, provenance.rank, None)
         if is_new or is_own:
@@ -507,7 +478,7 @@ class DomainEnd(Endpoint):
         live: bool,
         past: bool = False,
     ) -> None:
-        if not live and not past and self._history is not None and self._history.waits:
+        if not live and not past and self._history is not None and self._history.open:
             # The newest sample of a moving frame would make its past no news.
             batches = [(source, [sample for sample in samples if sample.static]) for source, samples in batches]
         if self.drop_lost:
@@ -527,7 +498,7 @@ class DomainEnd(Endpoint):
         if self.relay.is_plausible(number):
             return True
         error = ValueError(f"a batch with the number {number}, which is too far ahead of all others")
-        self.peers.reject(peer.id, "number", error, count)
+        self.reject(peer.id, "number", error, count)
         return False
 
     def _count_gap(self, peer: Peer, number: int, live: bool) -> bool:
@@ -552,12 +523,12 @@ class DomainEnd(Endpoint):
         if heard.number or peer.rate == inf:
             return False
         now = self._now()
-        since = now - self._thinned.get(peer.id, -inf)
+        since = now - peer.thinned
         # Samples that belong together come in several messages at once.
         if since > 0.02:
             if since < 0.9 / peer.rate:
                 return True
-            self._thinned[peer.id] = now
+            peer.thinned = now
         return False
 
     # Presence
@@ -587,11 +558,10 @@ class DomainEnd(Endpoint):
         self.lookups.left(peer.id)
         self._news.pop(peer.id, None)
         self._resting.pop(peer.id, None)
-        self._thinned.pop(peer.id, None)
         self._forget_robots(peer.robot)
         lost = {bus for bus in peer.paths if self.relay.way_closed(bus)}
         if peer.paths:
-            self.relay.reach_changed(self.outbox)
+            self.relay.reach_changed(self)
         return lost
 
     def _update_ways(self, peer: Peer, heard: Heard) -> None:
@@ -612,7 +582,7 @@ class DomainEnd(Endpoint):
         for bus in paths.keys() - before.keys():
             self.relay.way_opened(bus)
         lost = {bus for bus in before.keys() - paths.keys() if self.relay.way_closed(bus)}
-        self.relay.reach_changed(self.outbox)
+        self.relay.reach_changed(self)
         if self.drop_lost:
             self.relay.withdraw(self.relay.frames_of(lost), lost)
             self._show(peer, set(opened))
@@ -621,7 +591,7 @@ class DomainEnd(Endpoint):
     def _show(self, peer: Peer, buses: Collection[bytes]) -> None:
         """Publish what the copies hold of buses to which a way leads again."""
         batches = [
-            (Provenance(entry.origin, entry.number, self.outbox, peer), [entry.sample])
+            (Provenance(entry.origin, entry.number, self, peer), [entry.sample])
             for replica in (self._replicas.values() if buses else ())
             for entry in replica.entries.values()
             if entry.origin in buses and isinstance(entry.sample, ReceivedTransform)
@@ -659,7 +629,7 @@ class DomainEnd(Endpoint):
         seconds, after = fields.get("seconds"), fields.get("after")
         if isinstance(seconds, bool) or not isinstance(seconds, (int, float)) or not isinstance(after, str):
             raise MalformedMessageError("text", "a question for the past without a time and a name")
-        entries, final = self._history_teller.chunk(seconds, after)
+        entries, final = chunk_of_past(self.bus, self.relay, self.own, seconds, after)
         out = Outgoing(Kind.PAST, self.relay.origin, 0, Claim(0, 0, 0, final))
         self._wire.send(sender, write_message(out, entries))
 
@@ -667,7 +637,7 @@ class DomainEnd(Endpoint):
         self._wire.send(peer, write_text(Kind.PAST_QUESTION, {"seconds": seconds, "after": after}))
 
     def _take_past(self, peer: Peer, heard: Heard) -> None:
-        if self._history is None or not self._history.is_open(peer.id):
+        if self._history is None or peer.id not in self._history.open:
             return
         goes_on = heard.goes_on
         try:
@@ -675,7 +645,7 @@ class DomainEnd(Endpoint):
             for entry in heard.entries:
                 if isinstance(entry, ReceivedBatch) and self._admit_number(peer, entry.sequence, len(entry.samples)):
                     assert entry.origin is not None
-                    source = Provenance(entry.origin, entry.sequence, self.outbox, peer)
+                    source = Provenance(entry.origin, entry.sequence, self, peer)
                     batches.append((source, self._wanted(entry.samples)))
             self._publish(peer, batches, live=False, past=True)
             goes_on = goes_on or self._history.goes_on(peer.id, heard)
@@ -686,7 +656,7 @@ class DomainEnd(Endpoint):
     def _end_history(self, peer: str, lost: Peer | None = None) -> None:
         """Publish what waited for the past of a peer, with it or without it; the peer may be lost."""
         known = lost or self.peers.get(peer)
-        if self._history is not None and self._history.is_open(peer):
+        if self._history is not None and peer in self._history.open:
             held = self._history.end(peer)
             if known is not None:
                 # The newest samples that were told meanwhile, if no past has come.
@@ -713,18 +683,10 @@ class DomainEnd(Endpoint):
             return
         # Buses that have come or gone last are the last.
         self._replicas[gone] = self._replicas.pop(gone)
-        here = {peer.robot for peer in self.peers} | {self._robot}
+        here = {peer.robot for peer in self.peers.values()} | {self._robot}
         absent = [robot for robot in self._replicas if robot not in here]
         for robot in absent[: max(len(absent) - MOST_ROBOTS, 0)]:
             self._replicas.pop(robot).forget()
-
-    def _hearings(self) -> list[Hearing]:
-        channels = {inf: self._channel, 0.0: QUIET}
-        return [Hearing(robots, channels.get(rate, SLOW)) for robots, rate in self._robots.items()]
-
-    def _rate_of(self, robot: str) -> float:
-        hearings = zip(self._hearings(), self._robots.values(), strict=True)
-        return next((rate for hearing, rate in hearings if hearing.matches(robot)), inf)
 
 
 class _Due(NamedTuple):

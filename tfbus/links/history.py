@@ -34,62 +34,61 @@ MOST_REMEMBERED = 10_000
 """So many peers are remembered as asked."""
 
 
-class HistoryTeller:
-    """The moving samples of the last seconds that a link tells to a peer, from the buffers of a bus.
+def chunk_of_past(
+    bus: Bus, relay: Relay, replica: Replica, seconds: float, after: str
+) -> tuple[list[OutgoingBatch], bool]:
+    """The moving samples of the last seconds that a link tells to a peer, and whether these are all.
 
     Parameters
     ----------
     bus : Bus
+        Its buffers hold the samples.
     relay : Relay
         The relay of the bus.
     replica : Replica
         The link's copy of what it brings.
+    seconds : float
+    after : str
+        The samples are those of the frames whose names come after this one, as far as a chunk holds them.
     """
+    frames = replica.moving()
+    told: list[OutgoingBatch] = []
+    count = 0
+    for place in range(bisect_right(frames, after), len(frames)):
+        number = relay.newest_number(frames[place])
+        samples = [] if number is None else _recent(bus, frames[place], seconds)
+        if number is None or not samples:
+            continue
+        if told and count + len(samples) > CHUNK:
+            return told, False
+        told.append(OutgoingBatch(number[1], number[0], samples))
+        count += len(samples)
+    return told, True
 
-    def __init__(self, bus: Bus, relay: Relay, replica: Replica) -> None:
-        self._bus = bus
-        self._relay = relay
-        self._replica = replica
 
-    def chunk(self, seconds: float, after: str) -> tuple[list[OutgoingBatch], bool]:
-        """The samples of the frames whose names come after `after`, and whether those are all frames."""
-        frames = self._replica.moving()
-        told: list[OutgoingBatch] = []
-        count = 0
-        for place in range(bisect_right(frames, after), len(frames)):
-            number = self._relay.newest_number(frames[place])
-            samples = [] if number is None else self._recent(frames[place], seconds)
-            if number is None or not samples:
-                continue
-            if told and count + len(samples) > CHUNK:
-                return told, False
-            told.append(OutgoingBatch(number[1], number[0], samples))
-            count += len(samples)
-        return told, True
-
-    def _recent(self, frame: str, seconds: float) -> list[TransformStamped]:
-        """The newest samples of a frame, of the buffer that holds the longest history of it."""
-        held = (live.forest.frames.get(frame) for live in self._bus._buffers)
-        histories = [history for history in held if history is not None and history.oldest is not None]
-        if not histories:
-            return []
-        history = min(histories, key=_oldest)
-        newest = history.newest
-        assert newest is not None
-        low = newest - from_seconds(seconds)
-        samples = history.samples_between(low, newest)
-        start = max(len(samples) - MOST_OF_FRAME, 0)
-        stamps, rows = samples.stamps[start:].tolist(), samples.rows[start:].tolist()
-        parents, authorities = samples.parents, samples.authorities
-        recent = []
-        for place, (stamp, row) in enumerate(zip(stamps, rows, strict=True), start):
-            if stamp >= low:
-                sample = TransformStamped.__new__(TransformStamped)
-                parent = history.parent if parents is None else parents[place]
-                authority = history.authority if authorities is None else authorities[place]
-                sample._fields = parent, frame, stamp, tuple(row), authority, False
-                recent.append(sample)
-        return recent
+def _recent(bus: Bus, frame: str, seconds: float) -> list[TransformStamped]:
+    """The newest samples of a frame, of the buffer that holds the longest history of it."""
+    held = (live.forest.frames.get(frame) for live in bus._buffers)
+    histories = [history for history in held if history is not None and history.oldest is not None]
+    if not histories:
+        return []
+    history = min(histories, key=_oldest)
+    newest = history.newest
+    assert newest is not None
+    low = newest - from_seconds(seconds)
+    samples = history.samples_between(low, newest)
+    start = max(len(samples) - MOST_OF_FRAME, 0)
+    stamps, rows = samples.stamps[start:].tolist(), samples.rows[start:].tolist()
+    parents, authorities = samples.parents, samples.authorities
+    recent = []
+    for place, (stamp, row) in enumerate(zip(stamps, rows, strict=True), start):
+        if stamp >= low:
+            sample = TransformStamped.__new__(TransformStamped)
+            parent = history.parent if parents is None else parents[place]
+            authority = history.authority if authorities is None else authorities[place]
+            sample._fields = parent, frame, stamp, tuple(row), authority, False
+            recent.append(sample)
+    return recent
 
 
 def _oldest(history: FrameHistory) -> int:
@@ -114,6 +113,11 @@ class HistoryAsker:
         Asks a peer for so many seconds of the frames after a name.
     now : callable
         Returns a monotonic time in s.
+
+    Attributes
+    ----------
+    open : dict
+        Has the peers of which an answer is awaited, by their ids.
     """
 
     def __init__(self, seconds: float, ask: Callable[[str, float, str], object], now: Callable[[], float]) -> None:
@@ -121,7 +125,7 @@ class HistoryAsker:
         self._ask = ask
         self._now = now
         self._asked: dict[str, None] = {}
-        self._open: dict[str, _Open] = {}
+        self.open: dict[str, _Open] = {}
         self._size = 0
 
     def joined(self, peer: str) -> None:
@@ -130,12 +134,12 @@ class HistoryAsker:
             self._asked[peer] = None
             if len(self._asked) > MOST_REMEMBERED:
                 del self._asked[next(iter(self._asked))]
-            self._open[peer] = _Open(self._now() + PATIENCE)
+            self.open[peer] = _Open(self._now() + PATIENCE)
             self._ask(peer, self._seconds, "")
 
     def holds(self, peer: str, message: Heard) -> bool:
         """Hold a live message back; returns whether that is so."""
-        waiting = self._open.get(peer)
+        waiting = self.open.get(peer)
         if waiting is None or len(waiting.held) >= MOST_HELD:
             return False
         size = sum(1 + len(entry.samples) if isinstance(entry, ReceivedBatch) else 1 for entry in message.entries)
@@ -148,7 +152,7 @@ class HistoryAsker:
 
     def goes_on(self, peer: str, message: Heard) -> bool:
         """Take an answer, and ask for more if there is more; returns whether there is."""
-        waiting = self._open.get(peer)
+        waiting = self.open.get(peer)
         if waiting is None or message.claim.final:
             return False
         last = max(_children(message), default="")
@@ -159,18 +163,9 @@ class HistoryAsker:
         self._ask(peer, self._seconds, last)
         return True
 
-    @property
-    def waits(self) -> bool:
-        """Whether an answer of any peer is awaited."""
-        return bool(self._open)
-
-    def is_open(self, peer: str) -> bool:
-        """Whether an answer of a peer is awaited."""
-        return peer in self._open
-
     def end(self, peer: str) -> list[Heard]:
         """Await no answer of a peer any more; returns what was held back."""
-        waiting = self._open.pop(peer, None)
+        waiting = self.open.pop(peer, None)
         if waiting is None:
             return []
         self._size -= waiting.size
@@ -179,11 +174,11 @@ class HistoryAsker:
     def overdue(self) -> list[str]:
         """The peers whose answers have not come in time."""
         now = self._now()
-        return [peer for peer, waiting in self._open.items() if waiting.due <= now]
+        return [peer for peer, waiting in self.open.items() if waiting.due <= now]
 
     def next_due(self) -> float:
         """The time at which `overdue` is to be called next."""
-        return min((waiting.due for waiting in self._open.values()), default=inf)
+        return min((waiting.due for waiting in self.open.values()), default=inf)
 
 
 def _children(message: Heard) -> Iterable[str]:

@@ -23,7 +23,7 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.domain import DomainEnd
 from tfbus.links.endpoint import Endpoint, HearsTime
 from tfbus.links.history import LONGEST_HISTORY
-from tfbus.links.lookups import Answers, RemoteLookups
+from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import RemoteQuestion
 from tfbus.links.seams import Presence, Received, Wire
 from tfbus.registration import Registration, warn_unless_entered
@@ -245,7 +245,7 @@ class Link:
         end.host = self
         end.follower = ClockFollower(clock) if isinstance(clock, SimulatedClock) else clock
         self._told_clock = bus.clock if tell_clock and isinstance(bus.clock, SimulatedClock) else None
-        self._moves: Registration | None = None
+        self._registrations: list[Registration] = []
         self._stirred: anyio.Event | None = None
         self._receive_queue = ReceiveQueue(capacity)
         # The item that is being handled, and the rest of its parts.
@@ -257,13 +257,12 @@ class Link:
         self._entered = False
         self._attached = False
         self._tasks: anyio.abc.TaskGroup | None = None
-        self._jumps: Registration | None = None
         self._never_entered = warn_unless_entered(self)
 
     @property
     def peers(self) -> tuple[str, ...]:
         """The ids of the other ends that are there, sorted."""
-        return self._end.peers.present
+        return self._end.present
 
     def __repr__(self) -> str:
         count = len(self.peers)
@@ -274,7 +273,7 @@ class Link:
         """All counters, as they are now."""
         end = self._end
         return LinkStatistics(
-            peers=len(end.peers.present),
+            peers=len(end.present),
             sent_messages=end.report.messages,
             sent_samples=end.report.samples,
             received_messages=end.messages,
@@ -282,7 +281,7 @@ class Link:
             lost=end.lost,
             duplicates=end.duplicates,
             not_sent=dict(end.report.not_sent),
-            rejected=dict(end.peers.rejected),
+            rejected=dict(end.rejected),
             queue=self._receive_queue.statistics(),
         )
 
@@ -304,14 +303,14 @@ class Link:
             raise
         self._attached = True
         self.bus._entered.add(self)
-        self._jumps = self.bus.clock.on_jump(self._clock_jumped)
+        self._registrations.append(self.bus.clock.on_jump(self._clock_jumped))
         self._tasks = await anyio.create_task_group().__aenter__()
         self._tasks.start_soon(self._end.run)
         self._tasks.start_soon(self._work)
         if isinstance(self._end.follower, ClockFollower):
             self._tasks.start_soon(self._end.follower.run)
         if self._told_clock is not None:
-            self._moves = self._told_clock.on_move(self._end.tell_time)
+            self._registrations.append(self._told_clock.on_move(self._end.tell_time))
             self._end.tell_time(self._told_clock.now())
         # Items that came before the link was attached are still in the queue.
         self._received.wake()
@@ -321,10 +320,8 @@ class Link:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         assert self._tasks is not None
-        assert self._jumps is not None
-        self._jumps.close()
-        if self._moves is not None:
-            self._moves.close()
+        for registration in self._registrations:
+            registration.close()
         self._attached = False
         self._end.detach()
         self._end.send()
@@ -550,7 +547,7 @@ class DomainLink(Link):
             raise RuntimeError("the link is not entered")
         return self._domain_end.lookups
 
-    def serve(self, server: Answers | None) -> None:
+    def serve(self, server: BufferServer | None) -> None:
         """Say to all peers whether this link serves a buffer. Called by a `BufferServer`."""
         self._domain_end.serve(server)
 

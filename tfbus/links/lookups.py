@@ -45,16 +45,7 @@ PATIENCE = 3.0
 _MOST_SILENCES = 3
 _NUMBER = 8
 """Bytes of the number of a question, before what it says."""
-
-
-class Answers(Protocol):
-    """A buffer that is served over a link."""
-
-    def take(self, asker: str, number: int, data: bytes) -> None:
-        """Take a question or a cancellation of a link, by the link's number of the question."""
-
-    def lose(self, asker: str) -> None:
-        """Cancel the questions of a link that has gone."""
+_ARGUMENTS = "target", "source", "at", "max_age", "source_at", "fixed", "tolerance", "max_gap"
 
 
 class _Pending:
@@ -83,7 +74,7 @@ class RemoteLookups:
 
     Attributes
     ----------
-    server : Answers or None
+    server : BufferServer or None
         The buffer that this link serves.
     """
 
@@ -99,7 +90,7 @@ class RemoteLookups:
         self._servers: dict[str, str] = {}
         self._changed = anyio.Event()
         self._is_open = False
-        self.server: Answers | None = None
+        self.server: BufferServer | None = None
 
     # Coming in
 
@@ -139,7 +130,7 @@ class RemoteLookups:
         """Take a question of a link."""
         number = int.from_bytes(data[:_NUMBER], "little")
         if self.server is None:
-            self.answer(asker, number, self.refusal("absent", "nobody offers it"))
+            self.refuse(asker, number, "absent", "nobody offers it")
         elif len(data) > _NUMBER:
             self.server.take(asker, number, data[_NUMBER:])
 
@@ -159,13 +150,13 @@ class RemoteLookups:
             pending.answer = data[_NUMBER:]
             pending.done.set()
 
-    def answer(self, asker: str, number: int, answer: bytes) -> bool:
-        """Send an answer to a link; returns False if it is known not to arrive."""
-        return self._send(asker, write_body(Kind.LOOKUP_ANSWER, number.to_bytes(_NUMBER, "little") + answer))
+    def answer(self, asker: str, number: int, answer: bytes) -> None:
+        """Send an answer to a link."""
+        self._send(asker, write_body(Kind.LOOKUP_ANSWER, number.to_bytes(_NUMBER, "little") + answer))
 
-    def refusal(self, reason: str, detail: str) -> bytes:
-        """An answer that refuses a question."""
-        return write_answer(self._error(None, reason, detail))
+    def refuse(self, asker: str, number: int, reason: str, detail: str) -> None:
+        """Send an answer that refuses a question."""
+        self.answer(asker, number, write_answer(self._error(None, reason, detail)))
 
     # Going out
 
@@ -237,21 +228,6 @@ class RemoteLookups:
         return RemoteLookupError(domain=self._domain, robot=robot, reason=reason, detail=detail)
 
 
-class _Waiting:
-    """A question that waits; it may be cancelled before its task has begun."""
-
-    __slots__ = ("cancelled", "scope")
-
-    def __init__(self) -> None:
-        self.cancelled = False
-        self.scope: anyio.CancelScope | None = None
-
-    def cancel(self) -> None:
-        self.cancelled = True
-        if self.scope is not None:
-            self.scope.cancel()
-
-
 class Serving(Protocol):
     """A link that can serve a buffer."""
 
@@ -259,7 +235,7 @@ class Serving(Protocol):
     def lookups(self) -> RemoteLookups:
         """The lookups of the link; raises `RuntimeError` unless it is entered."""
 
-    def serve(self, server: Answers | None) -> None:
+    def serve(self, server: "BufferServer | None") -> None:
         """Say to all peers whether this link serves a buffer."""
 
 
@@ -303,7 +279,7 @@ class BufferServer:
         self._refilled = monotonic()
         self._entered = False
         self._never_entered = warn_unless_entered(self)
-        self._waiting: dict[tuple[str, int], _Waiting] = {}
+        self._waiting: dict[tuple[str, int], anyio.CancelScope] = {}
         self._counts: Counter[str] = Counter()
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._lookups: RemoteLookups
@@ -372,18 +348,18 @@ class BufferServer:
             if len(self._waiting) >= self._capacity:
                 self._refuse(*key, "busy", f"{self._capacity} lookups wait there, and no more may")
                 return
-            self._waiting[key] = waiting = _Waiting()
-            self._tasks.start_soon(self._wait, key, question, waiting)
+            self._waiting[key] = scope = anyio.CancelScope()
+            self._tasks.start_soon(self._wait, key, question, scope)
             return
         except Exception as error:  # noqa: BLE001 - it is told to the asker
             answer = error
         self._answer(key, answer)
 
-    async def _wait(self, key: tuple[str, int], question: RemoteQuestion, waiting: _Waiting) -> None:
+    async def _wait(self, key: tuple[str, int], question: RemoteQuestion, scope: anyio.CancelScope) -> None:
         answer: TransformStamped | Exception | None = None
-        if waiting.cancelled:
+        if scope.cancel_called:
             return
-        with anyio.CancelScope() as waiting.scope:
+        with scope:
             try:
                 timeout = as_timeout(question.timeout, LONGEST_WAIT)
                 answer = await self._buffer.lookup(**_arguments(question), timeout=timeout)
@@ -391,7 +367,7 @@ class BufferServer:
                 answer = error
             finally:
                 # Another question may have the number by now.
-                if self._waiting.get(key) is waiting:
+                if self._waiting.get(key) is scope:
                     del self._waiting[key]
         if answer is not None:
             self._answer(key, answer)
@@ -420,25 +396,16 @@ class BufferServer:
         return True
 
     def _cancel(self, key: tuple[str, int]) -> None:
-        waiting = self._waiting.pop(key, None)
-        if waiting is not None:
+        scope = self._waiting.pop(key, None)
+        if scope is not None:
             self._counts["cancelled"] += 1
-            waiting.cancel()
+            scope.cancel()
 
     def _refuse(self, asker: str, number: int, reason: str, detail: str) -> None:
         self._counts[reason] += 1
-        self._lookups.answer(asker, number, self._lookups.refusal(reason, detail))
+        self._lookups.refuse(asker, number, reason, detail)
 
 
 def _arguments(question: RemoteQuestion) -> dict[str, Any]:
-    return {
-        "target": question.target,
-        "source": question.source,
-        "at": question.at,
-        "max_age": question.max_age,
-        "source_at": question.source_at,
-        "fixed": question.fixed,
-        "tolerance": question.tolerance,
-        "max_gap": question.max_gap,
-        "extrapolate": None if question.hold is None else Hold(question.hold),
-    }
+    hold = None if question.hold is None else Hold(question.hold)
+    return {name: getattr(question, name) for name in _ARGUMENTS} | {"extrapolate": hold}

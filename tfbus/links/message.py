@@ -114,7 +114,7 @@ class Kind(enum.IntEnum):
 TEXTS = frozenset({Kind.QUESTION, Kind.PAST_QUESTION, Kind.LOOKUP, Kind.LOOKUP_ANSWER})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Outgoing:
     """The rest of a message, beside its entries.
 
@@ -142,8 +142,8 @@ class Outgoing:
 
 
 @dataclass(slots=True)
-class Heard:
-    """A message, or a part of one, as it came; `Outgoing` has the meaning of its first attributes.
+class Heard(Outgoing):
+    """A message, or a part of one, as it came.
 
     Attributes
     ----------
@@ -157,14 +157,7 @@ class Heard:
         Whether a later part follows; only after the last one the claim holds.
     """
 
-    kind: Kind
-    bus: bytes
-    number: int
-    claim: Claim
-    time: int | None
-    reach: Sequence[Way]
-    serves: bool
-    entries: list[ReceivedBatch | RemovedFrame]
+    entries: list[ReceivedBatch | RemovedFrame] = field(default_factory=list)
     errors: list[InvalidTransformError] = field(default_factory=list)
     continues: bool = False
     goes_on: bool = False
@@ -456,7 +449,7 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
     if at > len(data) or at > MAX_HEAD:
         raise IndexError
     claim = Claim(since, sequence, digest, bool(flags & _FINAL), bool(flags & _PARTIAL))
-    return Heard(kind, bus, number, claim, time, reach, bool(flags & _SERVES), []), entries, at
+    return Heard(kind, bus, number, claim, time, reach, bool(flags & _SERVES)), entries, at
 
 
 # Lookups

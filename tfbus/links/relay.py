@@ -23,7 +23,7 @@ way leads to any more. They are not removed: see `tfbus.links.replica`.
 import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby
 from math import inf
 from time import time_ns
@@ -53,6 +53,7 @@ Rank = tuple[int, bytes]
 LOWEST: Rank = (-1, b"")
 
 
+@dataclass(eq=False, slots=True)
 class OutgoingBatch:
     """Samples of one batch and one origin, as they go out.
 
@@ -65,12 +66,9 @@ class OutgoingBatch:
     samples : sequence of TransformStamped
     """
 
-    __slots__ = ("origin", "samples", "sequence")
-
-    def __init__(self, origin: bytes, sequence: int, samples: Sequence[TransformStamped]) -> None:
-        self.origin = origin
-        self.sequence = sequence
-        self.samples = samples
+    origin: bytes
+    sequence: int
+    samples: Sequence[TransformStamped]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,35 +101,32 @@ class Turn:
 
 
 class Outbox:
-    """The sending half of a link.
+    """The sending half of a link, in which batches and removals gather until the turn of the event loop ends.
 
     Parameters
     ----------
-    frames : collection of str or None
-        The children that may go out; None for all.
-    notify : callable
-        Called when something was added.
+    frames : iterable of str or None
+        The children that go out and come in; None for all.
 
     Attributes
     ----------
+    frames : frozenset of str or None
     pending : int
         How many samples and removals wait to go out.
-    time : int or None
-        The time of the clock that was told last, in ns.
     """
 
-    def __init__(self, frames: Collection[str] | None, notify: Callable[[], object]) -> None:
-        self._frames = frames
-        self._notify = notify
-        self._entries: list[OutgoingBatch | RemovedFrame] = []
-        self._time_waits = False
+    keeps_withdrawn = False
+    """Whether the other ends see for themselves that the owner of a frame was lost."""
+
+    def __init__(self, frames: Iterable[str] | None) -> None:
+        self.frames = None if frames is None else frozenset(frames)
         self.pending = 0
-        self.time: int | None = None
+        self._entries: list[OutgoingBatch | RemovedFrame] = []
 
     def add_batch(self, batch: OutgoingBatch, echo: bool = False) -> None:
         """Add samples that were published; an echo, samples that came in by this very link, does not go out."""
-        if self._frames is not None:
-            wanted = tuple(sample for sample in batch.samples if sample.child in self._frames)
+        if self.frames is not None:
+            wanted = tuple(sample for sample in batch.samples if sample.child in self.frames)
             if not wanted:
                 return
             batch = OutgoingBatch(batch.origin, batch.sequence, wanted)
@@ -146,7 +141,7 @@ class Outbox:
 
         A frame is withdrawn rather than removed if it left this bus only because its owner was lost.
         """
-        if self._frames is not None and removal.frame not in self._frames:
+        if self.frames is not None and removal.frame not in self.frames:
             return
         goes_out = not echo and not (withdrawn and self.keeps_withdrawn)
         if goes_out:
@@ -154,22 +149,6 @@ class Outbox:
             self.pending += 1
         if self._follow_removal(removal.frame, (removal.sequence, removal.origin) if goes_out else None) or goes_out:
             self._notify()
-
-    def tell_time(self, stamp: int) -> None:
-        """Tell the time of a clock, in ns, with what is sent next."""
-        self.time = stamp
-        self._time_waits = True
-        self._notify()
-
-    def flush(self) -> Turn:
-        """Remove and return all that has gathered."""
-        turn = Turn(self._entries, self._take_statics(), self.time if self._time_waits else None)
-        self._time_waits = False
-        self._entries, self.pending = [], 0
-        return turn
-
-    keeps_withdrawn = False
-    """Whether the other ends see for themselves that the owner of a frame was lost."""
 
     def keep(self, entry: OutgoingBatch | RemovedFrame) -> None:
         """Note what another link knows and is not, or no more, on this bus, for whoever shows it."""
@@ -189,6 +168,10 @@ class Outbox:
     def reach_changed(self) -> None:
         """The buses that this one reaches by other links have changed."""
 
+    def _notify(self) -> None:
+        """Something was added."""
+        raise NotImplementedError
+
     def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
         """Note the frames of a batch for late joiners; returns whether anything changes for these."""
         raise NotImplementedError
@@ -200,10 +183,8 @@ class Outbox:
         """
         raise NotImplementedError
 
-    def _take_statics(self) -> dict[str, TransformStamped | None]:
-        return {}
 
-
+@dataclass(eq=False, slots=True)
 class Peer:
     """The other end of a link, as far as this end knows it.
 
@@ -215,7 +196,9 @@ class Peer:
     robot : str
         The robot whose link it is; empty without one.
     rate : float
-        How often its newest samples are wanted, in Hz; infinite for everything, 0 for nothing.
+        How often newest samples are wanted of it, in Hz; infinite for everything, 0 for nothing.
+    thinned : float
+        The time of the newest samples that it has sent by such a rate, in s.
     number : int
         The number of its newest live message; 0 before the first.
     authorities : set of str
@@ -230,32 +213,20 @@ class Peer:
         The reasons of refusals that were reported.
     """
 
-    __slots__ = (
-        "authorities",
-        "authority_text",
-        "frames",
-        "id",
-        "number",
-        "paths",
-        "present",
-        "rate",
-        "reported",
-        "robot",
-    )
-
-    def __init__(self, id: str) -> None:  # noqa: A002 - the wire calls it so
-        self.id = id
-        self.present = False
-        self.robot = ""
-        self.rate = inf
-        self.number = 0
-        self.authorities: set[str] = set()
-        self.authority_text = 0
-        self.frames: set[str] = set()
-        self.paths: dict[bytes, tuple[bytes, ...]] = {}
-        self.reported = SeenKeys(REMEMBERED_REASONS)
+    id: str
+    present: bool = False
+    robot: str = ""
+    rate: float = inf
+    thinned: float = -inf
+    number: int = 0
+    authorities: set[str] = field(default_factory=set)
+    authority_text: int = 0
+    frames: set[str] = field(default_factory=set)
+    paths: dict[bytes, tuple[bytes, ...]] = field(default_factory=dict)
+    reported: SeenKeys = field(default_factory=lambda: SeenKeys(REMEMBERED_REASONS))
 
 
+@dataclass(eq=False, slots=True)
 class Provenance:
     """The source of a received batch or removal.
 
@@ -271,13 +242,10 @@ class Provenance:
         The other end of that link; None for this bus's own.
     """
 
-    __slots__ = ("origin", "outbox", "peer", "sequence")
-
-    def __init__(self, origin: bytes, sequence: int, outbox: Outbox | None = None, peer: Peer | None = None) -> None:
-        self.origin = origin
-        self.sequence = sequence
-        self.outbox = outbox
-        self.peer = peer
+    origin: bytes
+    sequence: int
+    outbox: Outbox | None = None
+    peer: Peer | None = None
 
     @property
     def rank(self) -> Rank:
@@ -296,6 +264,7 @@ class ReceivedTransform(TransformStamped):
         return TransformStamped, (self.parent, self.child, self.stamp, self.transform, self.authority, self.static)
 
 
+@dataclass(eq=False, slots=True)
 class ReceivedBatch:
     """Samples of one batch, as they came in.
 
@@ -311,19 +280,10 @@ class ReceivedBatch:
         The batch's number on that bus; without an origin it is not used.
     """
 
-    __slots__ = ("authorities", "origin", "samples", "sequence")
-
-    def __init__(
-        self,
-        samples: list[ReceivedTransform],
-        authorities: Collection[str],
-        origin: bytes | None = None,
-        sequence: int = 0,
-    ) -> None:
-        self.samples = samples
-        self.authorities = authorities
-        self.origin = origin
-        self.sequence = sequence
+    samples: list[ReceivedTransform]
+    authorities: Collection[str]
+    origin: bytes | None = None
+    sequence: int = 0
 
 
 class Relay:
@@ -351,9 +311,9 @@ class Relay:
         self._number = number
         self._bus = bus
         self._outboxes: list[Outbox] = []
-        # The newest number of each frame, by origin, and how many that are in all.
-        self._newest: dict[bytes, dict[str, int]] = {}
-        self._origins: dict[str, set[bytes]] = {}
+        # The newest number that each origin has given a frame; how many frames each origin has, and all together.
+        self._newest: dict[str, dict[bytes, int]] = {}
+        self._held: Counter[bytes] = Counter()
         self._frames = 0
         self._latest: dict[str, Provenance] = {}
         self._settled: dict[str, Rank] = {}
@@ -391,10 +351,9 @@ class Relay:
         self._outboxes.remove(outbox)
         if not self._outboxes:
             self._registration.close()
-            self._newest.clear()
             self._frames = 0
-            for by_frame in (self._origins, self._latest, self._settled, self._removed):
-                by_frame.clear()
+            for held in (self._newest, self._held, self._latest, self._settled, self._removed):
+                held.clear()
             self._passed = None
 
     def clock_jumped_back(self) -> None:
@@ -467,7 +426,7 @@ class Relay:
             return
         self._number = max(self._number, provenance.sequence)
         latest = self._latest.get(frame)
-        newest = self._newest.get(provenance.origin, {}).get(frame, -1)
+        newest = self._newest.get(frame, {}).get(provenance.origin, -1)
         if (
             newest < provenance.sequence
             and provenance.rank > self._removed.get(frame, LOWEST)
@@ -550,12 +509,12 @@ class Relay:
 
     def forget_origins(self, origins: Collection[bytes]) -> None:
         """Forget the numbers of buses that have gone, but for those of frames that are here."""
-        for origin in origins:
-            newest = self._newest.get(origin, {})
-            for frame in list(newest):
+        if origins:
+            for frame, newest in list(self._newest.items()):
                 latest = self._latest.get(frame)
-                if latest is None or latest.origin != origin:
-                    self._release(origin, frame)
+                for origin in newest.keys() & origins:
+                    if latest is None or latest.origin != origin:
+                        self._release(origin, frame)
 
     def mask(self, provenance: Provenance, samples: Sequence[TransformStamped]) -> None:
         """Withdraw frames of which a lost bus was the last to speak, until a way leads to it or others speak."""
@@ -593,11 +552,8 @@ class Relay:
         sequence, origin = provenance.sequence, provenance.origin
         self._number = max(self._number, sequence)
         rank = provenance.rank
-        newest = self._newest.get(origin)
-        if newest is None:
-            if len(self._newest) >= MAX_ORIGINS:
-                return len(list(samples))
-            newest = self._newest[origin] = {}
+        if origin not in self._held and len(self._held) >= MAX_ORIGINS:
+            return len(list(samples))
         passed, foreign = self._passed, origin == self.origin
         settled, removed = self._settled, self._removed
         for sample in samples:
@@ -607,26 +563,25 @@ class Relay:
                 continue
             if (child in settled or child in removed or static) and self._is_outranked(sample, rank):
                 continue
-            known = newest.get(child)
+            newest = self._newest.get(child)
+            known = None if newest is None else newest.get(origin)
             if known is None:
-                held = len(peer.frames) if foreign else len(newest)
+                held = len(peer.frames) if foreign else self._held[origin]
                 if held >= max_frames or self._frames >= MANY_PEERS * max_frames:
                     refused += 1
                     continue
                 if foreign:
                     peer.frames.add(child)
                 # Other samples of the batch may be of the same child.
-                newest[child] = -1
-                self._origins.setdefault(child, set()).add(origin)
+                self._newest.setdefault(child, {})[origin] = -1
+                self._held[origin] += 1
                 self._frames += 1
             elif known >= sequence:
                 continue
             sample._provenance = provenance
             news.append(sample)
         for sample in news[before:] if before else news:
-            newest[sample.child] = sequence
-        if not newest:
-            del self._newest[origin]
+            self._newest[sample.child][origin] = sequence
         return refused
 
     def _remove_from_bus(self, frame: str, provenance: Provenance | None) -> None:
@@ -640,7 +595,19 @@ class Relay:
             self._removing = None
 
     def _on_batch(self, batch: Batch) -> None:
-        for provenance, group in groupby(batch, _provenance_of):
+        self._pass_on(batch, _provenance_of, self._outboxes)
+
+    def _send_latched(self, batch: Batch, outbox: Outbox) -> None:
+        def known(sample: TransformStamped) -> Provenance | None:
+            return _provenance_of(sample) or self._latest.get(sample.child)
+
+        self._pass_on(batch, known, [outbox])
+
+    def _pass_on(
+        self, batch: Batch, known: Callable[[TransformStamped], Provenance | None], outboxes: Iterable[Outbox]
+    ) -> None:
+        """Note the samples of a batch, and give them to some links."""
+        for provenance, group in groupby(batch, known):
             if provenance is None:
                 provenance = Provenance(self.origin, self._next_number())
             samples = tuple(group)
@@ -655,24 +622,8 @@ class Relay:
                 if sample.static:
                     self._settled[child] = provenance.rank
             outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
-            for outbox in self._outboxes:
+            for outbox in outboxes:
                 outbox.add_batch(outgoing, echo=outbox is provenance.outbox)
-
-    def _send_latched(self, batch: Batch, outbox: Outbox) -> None:
-        def known(sample: TransformStamped) -> Provenance | None:
-            return _provenance_of(sample) or self._latest.get(sample.child)
-
-        for provenance, group in groupby(batch, known):
-            if provenance is None:
-                provenance = Provenance(self.origin, self._next_number())
-            samples = tuple(group)
-            for sample in samples:
-                if self._passed is not None:
-                    self._passed.add(sample)
-                self._latest[sample.child] = provenance
-                self._settled[sample.child] = provenance.rank
-            outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
-            outbox.add_batch(outgoing, echo=outbox is provenance.outbox)
 
     def _on_removal(self, frame: str) -> None:
         if self._removing is not None and self._removing[0] == frame:
@@ -702,19 +653,18 @@ class Relay:
             self._removed[frame] = provenance.rank
             if len(self._removed) > _REMEMBERED:
                 del self._removed[next(iter(self._removed))]
-        for origin in list(self._origins.get(frame, ())):
+        for origin in list(self._newest.get(frame, ())):
             self._release(origin, frame)
 
     def _release(self, origin: bytes, frame: str) -> None:
-        newest = self._newest[origin]
-        del newest[frame]
-        self._frames -= 1
+        newest = self._newest[frame]
+        del newest[origin]
         if not newest:
-            del self._newest[origin]
-        origins = self._origins[frame]
-        origins.remove(origin)
-        if not origins:
-            del self._origins[frame]
+            del self._newest[frame]
+        self._frames -= 1
+        self._held[origin] -= 1
+        if not self._held[origin]:
+            del self._held[origin]
 
     def _is_outranked(self, sample: ReceivedTransform, rank: Rank) -> bool:
         """Whether something else that was said of the frame holds: a removal, or a static sample of another bus."""

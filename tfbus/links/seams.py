@@ -11,7 +11,7 @@ import enum
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Final, NamedTuple, Protocol
 
 from tfbus.errors import InvalidTransformError
 from tfbus.links.relay import ReceivedBatch, Turn
@@ -291,6 +291,18 @@ class Carrier(Protocol):
         the entries of the same turn and may be conflated with later ones.
         """
 
+    def split(self, content: Any) -> Iterator[Any]:
+        """The content of an item in parts, for `read` one by one; an item that is small is its only part.
+
+        It may also yield None, where other tasks may have their turn before there is a part.
+
+        Raises
+        ------
+        MalformedMessageError
+            If the rest of the message cannot be used; the parts before it are.
+        """
+        return iter((content,))
+
     def read(self, content: Any) -> ReceivedMessage:
         """Decode a message: the content of an item that the carrier has passed to `receive`.
 
@@ -314,20 +326,4 @@ class Carrier(Protocol):
 
         The closing has to begin before the first checkpoint, because asyncio's own cancellation knows no shield, and
         has to return within about a second, whatever the network does.
-        """
-
-
-@runtime_checkable
-class SplittingCarrier(Carrier, Protocol):
-    """A carrier with messages that may be too large for one turn of the event loop."""
-
-    def split(self, content: Any) -> Iterator[Any]:
-        """The content of an item in parts, for `read` one by one; an item that is small is its only part.
-
-        It may also yield None, where other tasks may have their turn before there is a part.
-
-        Raises
-        ------
-        MalformedMessageError
-            If the rest of the message cannot be used; the parts before it are.
         """

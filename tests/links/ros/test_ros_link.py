@@ -161,7 +161,7 @@ def test_what_the_bus_refuses_is_counted_by_reason_and_announced_once_and_the_re
             end.hear_bytes(named(encode([moving("-", "a", stamp), moving("map", "b", stamp)]), "-", "/"))
             end.hear_bytes(b"garbage")
     rejected = [event for event in iter(events.queue.get, None) if isinstance(event, PeerRejected)]
-    assert end.endpoint.peers.rejected == {"self transform": 2, "frame name": 2, "truncated": 2}
+    assert end.endpoint.rejected == {"self transform": 2, "frame name": 2, "truncated": 2}
     assert [event.reason for event in rejected] == ["self transform", "frame name", "truncated"]
     assert [event.peer for event in rejected] == ["peer"] * 3
     assert getattr(rejected[0].error, "authority", "") == "/node"
@@ -245,7 +245,7 @@ def test_a_name_without_the_prefix_on_the_bus_or_with_it_in_ros_is_refused_and_t
     with end.bus.events() as events:
         end.hear(moving("base", "r1/b", 1))
         end.hear(moving("r1/base", "tool", 1))
-    assert end.endpoint.peers.rejected == {"prefix": 2}
+    assert end.endpoint.rejected == {"prefix": 2}
     (told,) = (event for event in iter(events.queue.get, None) if isinstance(event, PeerRejected))
     assert told.reason == "prefix"
     assert [getattr(told.error, name) for name in ("parent", "child", "authority")] == ["base", "r1/b", "/node"]
@@ -291,5 +291,5 @@ def test_positions_of_joints_are_handed_on_and_what_comes_of_that_is_counted() -
     for payload in (joint_state(5, {"a": 0.5, "b": 1.5}), b"garbage", joint_state(6, {"broken": 1.0})):
         end.carrier.hear(RosMessage(payload, static=False, authority="", joints=True))
     assert taken == [({"a": 0.5, "b": 1.5}, 5), ({"broken": 1.0}, 6)]
-    assert end.endpoint.peers.rejected == {"truncated": 1, "not published": 1}
+    assert end.endpoint.rejected == {"truncated": 1, "not published": 1}
     assert end.heard == []

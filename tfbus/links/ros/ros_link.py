@@ -20,7 +20,7 @@ from tfbus.links.link import Link
 from tfbus.links.relay import OutgoingBatch, ReceivedBatch, ReceivedTransform, Turn
 from tfbus.links.ros.messages import decode_clock, decode_text
 from tfbus.links.ros.settings import RosOptions, RosSettings
-from tfbus.links.seams import Received, ReceivedMessage, SendReport
+from tfbus.links.seams import Carrier, Received, ReceivedMessage, SendReport
 from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, MalformedMessageError, decode, decode_in_parts, refusal
 
@@ -68,7 +68,7 @@ class RosMessage:
         return not (self.joints or self.clock or self.description)
 
 
-class RosCarrier:
+class RosCarrier(Carrier):
     """A carrier to ROS, see `tfbus.links.seams.Carrier`; a subclass connects, publishes and closes.
 
     Parameters
