@@ -328,6 +328,28 @@ async def test_a_long_wait_has_one_timer_for_the_next_log_line_however_often_its
         asked.cancel()
 
 
+async def test_a_log_line_tells_of_the_lookups_that_have_waited_so_long_and_the_next_comes_five_seconds_later(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    clock = SimulatedClock()
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        bus.publish(driving("map", "base", 0.0))
+        async with anyio.create_task_group() as tasks:
+            asked = [Asked(tasks, partial(buffer.lookup, "map", name)) for name in ("a", "b")]
+            await clock.advance(1.0)
+            asked.append(Asked(tasks, partial(buffer.lookup, "map", "young")))
+            await clock.advance(8.9)
+            (message,) = caplog.messages
+            assert message.startswith("2 lookups have waited for more than 5 s: ")
+            assert "young" not in message
+            await clock.advance(0.1)
+            assert caplog.messages[1:] == [
+                "a lookup of 'young' in 'map' has waited for more than 5 s: frame 'young' is not known"
+            ]
+            for each in asked:
+                each.cancel()
+
+
 async def test_on_the_loop_of_another_thread_a_lookup_has_an_answer_and_does_not_wait_for_one() -> None:
     with Bus() as bus, Buffer(bus) as buffer:
 

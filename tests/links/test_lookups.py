@@ -30,9 +30,19 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.links import BufferServer, DomainLink
-from tfbus.links.message import Kind, Outgoing, kind_of, write_body, write_message
-from tfbus.links.remote_lookup import Cancellation, RemoteQuestion, read_answer, write_answer, write_question
-from tfbus.links.wire import Hearing
+from tfbus.links.message import (
+    Cancellation,
+    Kind,
+    Outgoing,
+    RemoteQuestion,
+    kind_of,
+    read_answer,
+    write_answer,
+    write_body,
+    write_message,
+    write_question,
+)
+from tfbus.links.seams import Hearing
 
 pytestmark = pytest.mark.anyio
 
@@ -68,6 +78,16 @@ async def asked(**options: Any) -> AsyncIterator[Scene]:
         ):
             yield Scene(network, bus, server, asker, link)
         assert other.statistics().samples == 0, "a link of rate 0 hears nothing but answers"
+
+
+async def test_a_server_is_entered_once_and_is_the_only_one_of_its_link() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with DomainLink(bus, "tf", MemoryNetwork().wire("r1"), robot="r1") as link:
+            async with BufferServer(buffer, link) as server:
+                with pytest.raises(RuntimeError, match="serves a buffer already"):
+                    await BufferServer(buffer, link).__aenter__()
+            with pytest.raises(RuntimeError, match="entered once"):
+                await server.__aenter__()
 
 
 @pytest.mark.every_loop

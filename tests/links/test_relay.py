@@ -413,30 +413,3 @@ def test_a_sample_is_known_by_child_parent_stamp_and_kind_and_a_static_one_by_it
     first: TransformStamped, second: TransformStamped, same: bool
 ) -> None:
     assert (second in passed(first)) is same
-
-
-def test_so_many_samples_of_each_child_are_remembered_and_what_passes_again_is_new() -> None:
-    samples = [moving("map", "a", stamp) for stamp in range(5)]
-    memory = passed(moving("map", "b", 0), *samples[:3], samples[0], samples[3])
-    assert [sample in memory for sample in samples] == [True, False, True, True, False]
-    assert moving("map", "b", 0) in memory
-
-
-def test_children_that_left_are_remembered_up_to_a_bound_and_one_that_came_back_as_before() -> None:
-    memory = passed(*(moving("map", name, 1) for name in ("back", "stays", *"abc")))
-    memory.retire("back")
-    memory.add(moving("map", "back", 2))
-    for name in ("never there", *"abac"):
-        memory.retire(name)
-    known = {name: moving("map", name, 1) in memory for name in ("back", "stays", *"abc")}
-    assert known == {"back": True, "stays": True, "a": True, "b": False, "c": True}
-
-
-def test_after_a_jump_back_only_static_samples_are_known_and_of_a_forgotten_child_none() -> None:
-    samples = moving("map", "a", 1), static("map", "a"), moving("map", "b", 1), static("map", "c")
-    memory = passed(*samples)
-    memory.retire("b")
-    memory.forget_moving()
-    memory.forget("c")
-    memory.forget("never there")
-    assert [sample in memory for sample in samples] == [False, True, False, False]

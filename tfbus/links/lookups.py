@@ -2,7 +2,7 @@
 
 A question goes to one peer of the robot that serves a buffer; its signs of life say so. It waits there as any lookup
 of that buffer does, for `LONGEST_WAIT` at most; then the asker is told what is missing, and asks again if it still
-wants to know. One that is given up is cancelled there. What comes from strangers passes `tfbus.links.remote_lookup`.
+wants to know. One that is given up is cancelled there. What comes from strangers passes `tfbus.links.message`.
 """
 
 import logging
@@ -22,14 +22,15 @@ from tfbus.bus.queues import check_capacity
 from tfbus.bus.subscribers import OnceLogger
 from tfbus.errors import MAY_COME, LookupTimeoutError, RemoteLookupError, TransformError, TransformLookupError
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.message import Kind, write_body
-from tfbus.links.remote_lookup import (
+from tfbus.links.message import (
     Cancellation,
+    Kind,
     RemoteQuestion,
     as_timeout,
     read_answer,
     read_question,
     write_answer,
+    write_body,
     write_question,
 )
 from tfbus.registration import warn_unless_entered

@@ -10,6 +10,8 @@ from support.samples import moving, static
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
+from cyclonedds.idl._support import Endianness
+
 from tfbus.links.dds.types import (
     Gid,
     Header,
@@ -49,11 +51,12 @@ def test_positions_of_joints_come_as_the_bytes_that_rosbags_reads() -> None:
     assert (read.name, read.position) == (["a", "b"], [0.5, 1.5])
 
 
-def test_the_nodes_of_a_participant_are_read_as_the_library_writes_them() -> None:
+@pytest.mark.parametrize("order", ["Little", "Big"])
+def test_the_nodes_of_a_participant_are_read_as_the_library_writes_them(order: str) -> None:
     gids: list[Any] = [Gid([number] * 16) for number in range(5)]  # type: ignore[arg-type]
     make: Any = NodeEntitiesInfo
     nodes: Any = [make("/robot", "driver", gids[1:2], gids[2:4]), make("/", "a", [], gids[4:])]
-    written = bytes(ParticipantEntitiesInfo(gids[0], nodes).serialize())
+    written = bytes(ParticipantEntitiesInfo(gids[0], nodes).serialize(endianness=Endianness[order]))
     own, second, third, fourth = (f"{number:02d}" * 16 for number in (0, 2, 3, 4))
     assert RawEntitiesInfo.deserialize(written).read() == (own, [("/robot/driver", [second, third]), ("/a", [fourth])])
 

@@ -27,7 +27,7 @@ from support.local_links import ALL, Ear, RawPeer, files_in, framed, running
 from support.processes import OPEN_FILES, Program
 
 from tfbus.links.local.local_wire import MOST_STRANGERS, MOST_UNFINISHED, LocalWire
-from tfbus.links.wire import MAX_MESSAGE, Hearing, Joined, Left
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left
 
 pytestmark = pytest.mark.anyio
 
@@ -401,7 +401,7 @@ PEER = """
 import os, signal, sys
 import anyio
 from tfbus.links.local.local_wire import LocalWire
-from tfbus.links.wire import Hearing
+from tfbus.links.seams import Hearing
 
 async def main():
     wire = LocalWire("domain", "peer", directory=sys.argv[1], loopback=bool(sys.argv[4]))

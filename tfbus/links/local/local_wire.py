@@ -59,10 +59,9 @@ import anyio
 import anyio.lowlevel
 
 from tfbus._aio.turn_budget import TurnBudget
-from tfbus.links.local.connection import Connection, Hello, frame_of
+from tfbus.links.local.connection import Connection, Hello, Poll, frame_of
 from tfbus.links.local.meeting_place import MeetingPlace
-from tfbus.links.local.poll import Poll
-from tfbus.links.wire import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
 from tfbus.tf_message import MalformedMessageError
 
 MOST_CONNECTIONS: Final = 1_000
@@ -139,6 +138,9 @@ class LocalWire(Wire):
 
     def is_heard(self, channel: str) -> bool:
         return bool(self._hearers.get(channel))
+
+    def is_behind(self) -> bool:
+        return any(readable for _, readable, _ in self._poll.ready())
 
     def publish(self, channel: str, message: bytes) -> None:
         hearers = self._hearers.get(channel)
