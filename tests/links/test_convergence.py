@@ -1,5 +1,7 @@
 """The promise of the link: some seconds after any trouble, all buses of a domain hold the same."""
 
+from collections.abc import Sequence
+
 import pytest
 from support.domains import Network, Process, World, agree, shown
 from support.samples import moving, static
@@ -10,7 +12,20 @@ NAMES = [f"static{k}" for k in range(5)]
 LIMIT = 10.0
 
 
-def trouble(world: World, networks: list[Network], steps: int, drop_lost: list[bool]) -> None:
+PLACES = {
+    "one network": [[0], [0], [0], [0], [0]],
+    "two bridges": [[0, 1], [0, 1], [0], [0], [1]],
+    "a ring": [[0, 1], [1, 2], [0, 2], [0], [2]],
+    "two machines": [[0, 1], [0, 2], [1], [1], [2], [0]],
+}
+"""The networks on which processes are that are started again when they die."""
+ALL_TROUBLES = (25, 15, 12, 6, 6, 6, 6, 8, 6, 8, 6, 3, 4, 4)
+OF_PLACES = (25, 15, 12, 0, 0, 6, 6, 8, 6, 12, 6, 3, 4, 4)
+
+
+def trouble(
+    world: World, networks: list[Network], steps: int, drop_lost: list[bool], kinds: Sequence[int] = ALL_TROUBLES
+) -> None:
     """Publish, remove, start, kill, stop, cut and lose at random."""
     draw = world.random
     for _ in range(steps):
@@ -19,11 +34,11 @@ def trouble(world: World, networks: list[Network], steps: int, drop_lost: list[b
             break
         process, network = draw.choice(running), draw.choice(networks)
         wire = draw.choice(process.wires)
-        match draw.choices(range(9), (25, 15, 12, 6, 6, 6, 6, 8, 6))[0]:
+        match draw.choices(range(len(kinds)), kinds)[0]:
             case 0:
                 process.publish(draw.choice(NAMES), static=True)
             case 1:
-                process.publish(f"moving of {process.wires[0].id[:4]}", static=False)
+                process.publish(f"moving of {process.name}", static=False)
             case 2:
                 process.remove(draw.choice([*process.frames, *NAMES]))
             case 3 if len(world.processes) < 6:
@@ -43,6 +58,24 @@ def trouble(world: World, networks: list[Network], steps: int, drop_lost: list[b
                 network.loss = draw.choice([0.0, 0.3, 0.9])
                 if not network.loss:
                     network.heal()
+            case 9:
+                world.kill(process)
+                world.run(draw.choice([0.0, 0.001, 0.5]))
+                again = world.process(*process.networks, drop_lost=process.drop_lost, name=process.name)
+                again.publish(f"static of {again.name}", static=True)
+                again.publish(f"moving of {again.name}", static=False)
+            case 10:
+                wire.network.silence(wire)
+            case 11:
+                # More than a stopped process has room for.
+                for _ in range(150):
+                    process.publish(f"moving of {process.name}", static=False)
+            case 12:
+                process.publish(f"either of {process.name}", static=draw.random() < 0.5)
+            case 13:
+                frame = draw.choice(NAMES)
+                process.remove(frame)
+                process.publish(frame, static=True)
         world.run(draw.choice([0.0, 0.001, 0.01, 0.1, 1.0, 3.0, 8.0]))
 
 
@@ -54,8 +87,10 @@ def end_of_trouble(world: World, networks: list[Network]) -> None:
             process.go_on()
 
 
-def check_nothing_invented(world: World) -> None:
+def check_truth(world: World) -> None:
+    """Nothing was invented, refused, or heard twice."""
     for process in world.processes:
+        assert process.again == []
         assert {(sample.child, sample.stamp) for sample in process.seen} <= world.published
         for end in process.ends:
             assert not end.rejected
@@ -81,7 +116,7 @@ def test_all_buses_show_the_same_some_seconds_after_any_trouble(seeds: range, dr
         trouble(world, [network], world.random.randint(5, 40), [drop_lost])
         end_of_trouble(world, [network])
         until_they_agree(world, [world.processes])
-        check_nothing_invented(world)
+        check_truth(world)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +132,7 @@ def test_buses_with_both_settings_agree_among_themselves(seeds: range) -> None:
         end_of_trouble(world, [network])
         settings = [[p for p in world.processes if p.drop_lost is drop] for drop in (False, True)]
         until_they_agree(world, [group for group in settings if group])
-        check_nothing_invented(world)
+        check_truth(world)
 
 
 @pytest.mark.parametrize("drop_lost", [False, True])
@@ -109,7 +144,7 @@ def test_links_that_hear_only_some_frames_hold_exactly_these_in_the_end(seeds: r
         world = World(seed)
         network = Network(world)
         others = [world.process(network, drop_lost=drop_lost) for _ in range(3)]
-        chosen = {"static0", "static3", *(f"moving of {process.wire.id[:4]}" for process in others[:2])}
+        chosen = {"static0", "static3", *(f"moving of {process.name}" for process in others[:2])}
         leaves = [world.process(network, drop_lost=drop_lost, frames=frames) for frames in (chosen, {"static0"}, set())]
         world.run(world.random.choice((0.0, 5.0)))
         trouble(world, [network], 30, [drop_lost])
@@ -142,7 +177,27 @@ def test_buses_behind_bridges_and_in_rings_agree(seeds: range, drop_lost: bool) 
             world.process(*some, drop_lost=drop_lost)
         end_of_trouble(world, networks)
         until_they_agree(world, [world.processes])
-        check_nothing_invented(world)
+        check_truth(world)
+
+
+@pytest.mark.parametrize("drop_lost", [False, True])
+@pytest.mark.parametrize("places", PLACES.values(), ids=PLACES)
+@pytest.mark.parametrize(
+    "seeds", [range(1), pytest.param(range(1, 50), marks=pytest.mark.thorough)], ids=["few", "many"]
+)
+def test_programs_that_are_started_again_agree_after_each_of_several_troubles(
+    seeds: range, places: list[list[int]], drop_lost: bool
+) -> None:
+    for seed in seeds:
+        world = World(seed)
+        networks = [Network(world) for _ in range(3)]
+        for place in places:
+            world.process(*(networks[number] for number in place), drop_lost=drop_lost)
+        for _ in range(5):
+            trouble(world, networks, world.random.randint(1, 15), [drop_lost], OF_PLACES)
+            end_of_trouble(world, networks)
+            until_they_agree(world, [world.processes])
+            check_truth(world)
 
 
 @pytest.mark.parametrize("seconds", [1.5, 7.0, 30.0])

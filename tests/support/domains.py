@@ -45,6 +45,7 @@ class World:
         self.now = 1_000.0
         self.processes: list[Process] = []
         self.published: set[tuple[str, int]] = set()
+        self.names = count()
         self._numbers = count()
         self._events: list[tuple[float, int, Callable[[], object]]] = []
         self._arrivals: dict[tuple[object, object], float] = {}
@@ -115,6 +116,12 @@ class Network:
             if other is not wire and outwards:
                 self.cuts.add((wire, other))
                 other.part(wire)
+
+    def silence(self, wire: "Wire", lease: float = 4.0) -> None:
+        """Cut a link off from all others, which notice that after a while, unless the network has healed by then."""
+        cut = {pair for other in self.wires if other is not wire for pair in ((other, wire), (wire, other))}
+        self.cuts |= cut
+        self.world.arrive(wire, self, lambda: [one.part(other) for other, one in cut & self.cuts], lease)
 
     def heal(self) -> None:
         self.cuts.clear()
@@ -312,6 +319,8 @@ class Process:
     ) -> None:
         self.world = world
         self.bus = Bus(SimulatedClock(int(world.now * SECOND)), max_ahead=None)
+        self.networks = networks
+        self.name: str = options.pop("name", f"{next(world.names)}")
         self.drop_lost = drop_lost
         self.stopped = False
         self.sending = False
@@ -324,6 +333,9 @@ class Process:
         self.ends: list[Endpoint] = [*self.domain_ends, *self.foreign_ends]
         self.frames: dict[str, TransformStamped] = {}
         self.seen: list[TransformStamped] = []
+        # What was heard more than once; what was taken off the bus because its owner was lost may be put back.
+        self.again: list[TransformStamped] = []
+        self._ever: dict[str, set[int]] = {}
         self.batches: list[Batch] = []
         self.removed: list[str] = []
         self._hosts = [Host(self, end) for end in self.ends]
@@ -392,12 +404,18 @@ class Process:
         for sample in batch:
             known = self.frames.get(sample.child)
             self.seen.append(sample)
+            ever = self._ever.setdefault(sample.child, set())
+            if sample.stamp in ever:
+                self.again.append(sample)
+            ever.add(sample.stamp)
             if known is None or sample.static != known.static or sample.stamp >= known.stamp or sample.static:
                 self.frames[sample.child] = sample
 
     def _note_removal(self, frame: str) -> None:
         self.removed.append(frame)
         self.frames.pop(frame, None)
+        if self.drop_lost:
+            self._ever.pop(frame, None)
 
 
 class SlowWorld(ForeignWorld):
