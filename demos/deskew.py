@@ -1,8 +1,9 @@
-"""A laser scan from a robot that drives and turns while it scans, made straight.
+"""Deskew a laser scan from a robot that drives and turns while it scans.
 
 The laser sweeps half a turn in 0.1 s. Meanwhile the robot drives at 2 m/s towards a flat wall and turns at 1.5 rad/s,
-so each ray leaves from another place. If all rays are taken for one instant, the wall comes out bent. If each goes by
-the transform of its own stamp, it comes out flat. The odometry arrives 30 ms late: the scan waits for it.
+so each ray starts from another place. If all rays use the transform of one instant, the wall comes out bent. If each
+ray uses the transform at its own stamp, the wall comes out flat. The odometry arrives 30 ms late: the scan waits for
+it.
 
 Run it with `python demos/deskew.py`. The time is simulated, so it ends at once and always prints the same.
 """

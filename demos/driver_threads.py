@@ -1,8 +1,8 @@
 """Two drivers, each in a thread of its own, publish on a bus that lives in an event loop.
 
-A driver that blocks, such as one that reads a serial port, has a thread. It hands its samples over through
-`bus.threadsafe()`; the event loop publishes them, and a task reads them from a stream. What happens if a thread calls
-`bus.publish` itself is shown first.
+A driver that blocks, for example on a serial port, has a thread. It hands its samples over through `bus.threadsafe()`;
+the event loop publishes them, and a task reads them from a stream. At first, a thread calls `bus.publish` itself, to
+show the error.
 
 Run it with `python demos/driver_threads.py`; it takes a quarter of a second.
 """
@@ -32,7 +32,7 @@ async def run_drivers(bus: tfbus.Bus) -> None:
         async with anyio.create_task_group() as drivers:
             drivers.start_soon(anyio.to_thread.run_sync, partial(drive, publish, "left_wheel", 1.0))
             drivers.start_soon(anyio.to_thread.run_sync, partial(drive, publish, "right_wheel", -1.0))
-    # The end of the `with` has published what was still pending; now the stream can end.
+    # The end of the `with` has published the pending samples; now the stream can end.
     bus.close()
 
 

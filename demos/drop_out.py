@@ -1,8 +1,8 @@
 """A tracker loses its target: an answer for the gap, and a way to know that there was one.
 
-A drone flies a circle of 2 m radius, once in 4 s. A tracker reports it at 100 Hz, but not between 2 s and 3 s. Whoever
-asks for it says how far the answer may depart from what was seen, and is told how far it did. The true place is known
-here, so each answer is printed with its error. Run it with `python demos/drop_out.py`; time is simulated.
+A drone flies a circle of 2 m radius, once in 4 s. A tracker reports it at 100 Hz, but not between 2 s and 3 s. Each
+lookup says how far the answer may depart from the measurements, and each answer tells how far it did. The true place is
+known here, so each answer is printed with its error. Run it with `python demos/drop_out.py`; time is simulated.
 """
 
 import math

@@ -1,8 +1,8 @@
-"""A tool is taken up, argued about, lost and given back, and a monitor tells of all of it.
+"""An arm takes up a tool, defends its frame, and puts it down, and a monitor prints all events.
 
 An arm owns the frame of its tool for as long as it holds the tool. A second program believes that it holds the same
-tool: its samples are refused, and it is told why. The odometry dies and comes back. The localisation and a person
-disagree about where the robot is: that is allowed, and reported.
+tool: its samples are refused with the reason. The odometry dies and comes back. The localisation and a person disagree
+about the place of the robot: that is allowed, and reported.
 
 Run it with `python demos/events_and_ownership.py`. The time is simulated, so it ends at once and always prints the
 same.

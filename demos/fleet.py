@@ -1,9 +1,9 @@
 """A fleet on one machine: many robots behind a router, and a dashboard that hears ten in full and all once a second.
 
 The robots are links of their own in a few processes; each has `--frames` moving frames at `--rate`. The dashboard looks
-for some seconds with each of three views: no robot (what a link costs at rest), ten in full, and all at 1 Hz. The table
-says what each view costs the dashboard and the router (cores), what it brings (MB/s, samples/s), and how old the newest
-poses are that it shows. Robots for which the machine is too slow publish at less than `--rate`: it tells that as well.
+for some seconds with each of three views: no robot (the cost of a link at rest), ten in full, and all at 1 Hz. For each
+view, the table has the cost for the dashboard and the router (cores), the received data (MB/s, samples/s), and the age
+of the newest poses. If the machine is too slow, robots publish at less than `--rate`: the table shows that as well.
 
 Run it with `python demos/fleet.py --robots 100`; a thousand robots are for a machine with many cores.
 """

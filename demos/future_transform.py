@@ -1,11 +1,11 @@
-"""Waiting for the transform of the very instant at which something was seen.
+"""Wait for the transform at the stamp of a detection.
 
-The odometry of a robot that drives at 1 m/s arrives 80 ms late. A camera detection is there at once, so its stamp is 80
-ms ahead of the newest transform. Where was that in the map? Three detections, three answers:
+The odometry of a robot that drives at 1 m/s arrives 80 ms late. A camera detection arrives at once, so its stamp is 80
+ms ahead of the newest transform. Where was the detection in the map? Three detections, three answers:
 
 * The first is awaited, and comes out as soon as the odometry has caught up: exact, not extrapolated.
-* The second is older than anything that the buffer holds. Waiting cannot help, so it fails at once.
-* The third was made by a camera that nobody has told us about. It times out, and says what was still missing.
+* The second is older than all samples in the buffer. Waiting cannot help, so it fails at once.
+* The third comes from an unknown camera. It times out, and the error says what was still missing.
 
 Run it with `python demos/future_transform.py`.
 """

@@ -1,8 +1,8 @@
-"""Every camera detection with the transform of its own instant, and no word lost about those that have none.
+"""Pair camera detections with the transforms at their own stamps, and count the detections without one.
 
-The odometry of a robot that drives at 1 m/s arrives 80 ms late; a camera detection is there at once. The filter holds
-each detection until it can be placed in the map exactly, and lets it out then. Two detections never come out: one is a
-minute old, one is from a camera that nobody has told us about. They are counted, and the callback says why.
+The odometry of a robot that drives at 1 m/s arrives 80 ms late; a camera detection arrives at once. The filter holds
+each detection until its transform is known. Two detections never come out: one is a minute old, one comes from an
+unknown camera. They are counted, and the callback gets the reason.
 
 Run it with `python demos/message_filter.py`.
 """

@@ -1,7 +1,7 @@
 """Ten thousand positions and a few velocities of a tool, from a tree that has never seen an event loop.
 
-A turntable drives along x at 0.5 m/s and turns at 1 rad/s; a tool is fixed to it, 2 m from the axis. So the tool goes
-along a cycloid: where it is and how fast has a closed form, which is printed beside what the tree says.
+A turntable drives along x at 0.5 m/s and turns at 1 rad/s; a tool is fixed to it, 2 m from the axis. So the tool moves
+on a cycloid: its position and velocity have closed forms, which are printed beside the answers of the tree.
 
 Run it with `python demos/path_and_velocity.py`.
 """

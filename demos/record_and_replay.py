@@ -1,8 +1,8 @@
-"""A robot is recorded, its drive is asked about without an event loop, and then it drives once more.
+"""Record a robot, look up its path without an event loop, and play the recording.
 
 The robot goes round a circle of 2 m once in 8 s, with a camera in front of it. The recording is an MCAP file that ROS 2
-and Foxglove read as well. `load` makes a tree of it, in which everything that ever was can be looked up at once; a
-player publishes it again, and whatever listens to the bus cannot tell it from the robot.
+and Foxglove read as well. `load` makes a tree of it, which answers lookups at every recorded stamp. A player publishes
+it again, and listeners on the bus cannot tell it from the robot.
 
 Run it with `python demos/record_and_replay.py`, or with a path to keep the recording there. The time is simulated, so
 it ends soon and always prints the same.

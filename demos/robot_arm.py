@@ -1,8 +1,8 @@
 """A whole robot from its URDF: an arm of seven joints at 100 Hz, with a camera on its hand that sees something.
 
-Each detection is stamped between two messages of the joints, so it waits a few milliseconds for the next one, and is
-placed in the base at its own instant. It is straight ahead of the camera, so its place has a closed form, too. The
-arm itself is in `robot_arm.urdf`. Run it with `python demos/robot_arm.py`.
+Each detection has a stamp between two messages of the joints, so it waits a few milliseconds for the next message, and
+is then transformed into the base at its own stamp. It is straight ahead of the camera, so its place has a closed form,
+too. The arm itself is in `robot_arm.urdf`. Run it with `python demos/robot_arm.py`.
 """
 
 import cmath

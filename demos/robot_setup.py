@@ -1,7 +1,7 @@
 """The classic tf tutorial in one process: a broadcaster at 100 Hz and a listener at 1 Hz share a bus.
 
 A robot has a base, `base_link`, and a laser, `base_laser`, mounted 0.1 m forward of it and 0.2 m above. The broadcaster
-says so, and the listener takes a point that the laser sees and asks where it is, seen from the base.
+publishes this transform, and the listener transforms a point that the laser sees into the base.
 
 Run it with `python demos/robot_setup.py`; Ctrl-C ends it. `tfbus demo` does the same with options.
 """
@@ -12,7 +12,7 @@ import tfbus
 
 
 async def broadcast(bus: tfbus.Bus) -> None:
-    # The loop goes on whatever edges others publish: what the bus refuses is left out, counted, and logged once.
+    # No edge of another program may end the loop: refused samples are left out, counted, and logged once.
     broadcaster = tfbus.TransformBroadcaster(bus, authority="robot_tf_publisher", invalid="drop")
     base_from_laser = tfbus.Transform(translation=(0.1, 0.0, 0.2))
     async for _ in bus.clock.ticks(100.0):

@@ -1,8 +1,8 @@
-"""A scan from a robot that speaks ROS, where a program without ROS needs it.
+"""Transform a scan of a robot with ROS in a program without ROS.
 
-What would be two processes are here in one, so that it runs anywhere: they share nothing but a DDS domain, where any
-ROS 2 node would hear them. The robot drives along x at 1 m/s, and has a laser 0.2 m before its base. The program
-holds a scan as ROS gives it, awaits the transform of the scan's own stamp, and tells where the scan hit something.
+The robot and the program run in one process here, so that the demo runs anywhere. They share only a DDS domain, where
+any ROS 2 node would hear them. The robot drives along x at 1 m/s, and has a laser 0.2 m before its base. The program
+takes a scan message of ROS, awaits the transform at the scan's own stamp, and prints where the scan hit something.
 
 Run it with `python demos/ros_bridge.py`. With a robot's place instead, as in `python demos/ros_bridge.py 42` for
 ROS_DOMAIN_ID 42, it prints that robot's tree for three seconds. It needs `pip install ".[dds]"`.

@@ -1,11 +1,11 @@
-"""An hour of patrol in a second, and what a jump back of the clock does.
+"""An hour of patrol in a second, and the effect of a jump back of the clock.
 
 A robot goes round a circle once in ten minutes and says where it is once a second. A camera takes a picture every
 quarter of an hour, between two of these samples, so that each picture waits for the next sample. All of it runs on a
 `SimulatedClock`, so an hour takes about a second, and prints the same on every event loop.
 
-Then somebody starts the simulation anew: the clock jumps back to 0. What moved is forgotten, what is static stays, and
-whoever waited for a stamp of the old time is told.
+Then the simulation starts anew: the clock jumps back to 0. Moving frames are forgotten, static frames stay, and a wait
+for a stamp of the old time raises an error.
 
 Run it with `python demos/simulated_time.py`.
 """

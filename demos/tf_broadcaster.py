@@ -1,8 +1,8 @@
-"""The first of the tutorial's two programs: it says 100 times a second where the robot's laser is.
+"""The first of the tutorial's two programs: it publishes the pose of the robot's laser 100 times a second.
 
-Run it with `python demos/tf_broadcaster.py`, and `python demos/tf_listener.py` in another terminal, in whatever order.
-Kill either and start it again: the other one goes on by itself. Ctrl-C ends it. Programs on this machine find each
-other; a name as argument is a domain of its own. `tfbus broadcast` does the same with options.
+Run it with `python demos/tf_broadcaster.py`, and `python demos/tf_listener.py` in another terminal, in any order. Kill
+either program and start it again: the other one goes on by itself. Ctrl-C ends it. Programs on this machine find each
+other; an argument names another domain. `tfbus broadcast` does the same with options.
 """
 
 import sys
@@ -14,7 +14,7 @@ import tfbus
 
 async def main(domain: str) -> None:
     with tfbus.Bus() as bus:
-        # On a shared domain, an edge of another program must not end this one: what the bus refuses is left out.
+        # On a shared domain, an edge of another program must not end this one: refused samples are left out.
         broadcaster = tfbus.TransformBroadcaster(bus, authority="robot_tf_publisher", invalid="drop")
         # The laser is mounted 0.1 m forward of the robot's base, and 0.2 m above it.
         base_from_laser = tfbus.Transform(translation=(0.1, 0.0, 0.2))

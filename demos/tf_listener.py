@@ -1,6 +1,6 @@
-"""The second of the tutorial's two programs: it takes a point that the laser sees, and asks where the base sees it.
+"""The second of the tutorial's two programs: it transforms a point that the laser sees into the base.
 
-Run it with `python demos/tf_listener.py`, and `python demos/tf_broadcaster.py` in another terminal, in whatever order.
+Run it with `python demos/tf_listener.py`, and `python demos/tf_broadcaster.py` in another terminal, in any order.
 Without a broadcaster it says what is missing. Ctrl-C ends it. `tfbus listen` does the same with options.
 """
 

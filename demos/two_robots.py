@@ -1,9 +1,10 @@
 """Two robots with the same frame names share one bus, and one sees the other through the map.
 
-Robot 1 drives round a circle of 2 m in the map, robot 2 twice as fast round one of 3 m. Each publishes under its own
-prefix what it calls `base_link`, `camera` and `gripper`; the map is the same for both. So a robot asks about itself in
-its own names, and whoever listens without a prefix can ask across: where is robot 2's gripper, seen from robot 1's
-camera? Neither robot may end because of what the other publishes, so each leaves out what the bus refuses.
+Robot 1 drives round a circle of 2 m in the map, robot 2 twice as fast round a circle of 3 m. Each robot publishes its
+frames `base_link`, `camera` and `gripper` under its own prefix; the map is the same for both. So a robot asks about
+itself in its own names, and a buffer without a prefix can ask about both: where is robot 2's gripper, seen from robot
+1's camera? Neither robot may end because of samples of the other, so each leaves out its own samples that the bus
+refuses.
 
 Run it with `python demos/two_robots.py`.
 """
@@ -18,7 +19,7 @@ SHARED = {"map"}
 
 
 async def drive(bus: tfbus.Bus, name: str, radius: float, speed: float, start: int) -> None:
-    """Publish the frames of a robot that goes round the map's origin, at so many rad/s, and looks where it goes."""
+    """Publish the frames of a robot that goes round the map's origin, at `speed` rad/s, and looks ahead."""
     robot = tfbus.TransformBroadcaster(bus, authority=name, prefix=f"{name}/", shared=SHARED, invalid="drop")
     robot.send_static("base_link", "camera", tfbus.Transform(translation=(0.2, 0.0, 1.0)))
     robot.send_static("base_link", "gripper", tfbus.Transform(translation=(0.5, 0.0, 0.4)))

@@ -1,4 +1,4 @@
-"""A web service that answers where a frame is, streams it, and waits for the answer if it must.
+"""A web service that looks up transforms, waits for them if necessary, and streams their changes.
 
 The bus, the buffer and a robot that drives in a circle live in the application's lifespan. The routes are
 
@@ -13,8 +13,8 @@ The bus, the buffer and a robot that drives in a circle live in the application'
 A lookup answers 200 with JSON, 404 with close matches for a frame that nobody has published, 504 with the reason when
 the time is up, 400 for a question that can never be answered, and 503 while the service is going down.
 
-A browser connects to this machine for any page that asks it to. So the service answers to its own names only (`HOSTS`),
-and a WebSocket to pages that it has served itself, or that `ORIGINS` names.
+A browser connects to this machine for any web page. So the service answers to its own names only (`HOSTS`), and opens a
+WebSocket only for its own pages and the pages of `ORIGINS`.
 
 Run it with `pip install ".[web]"`, then `python demos/web_app.py`, and open http://127.0.0.1:8000.
 """
@@ -144,13 +144,13 @@ async def changes(request: Request) -> Response:
 
 async def poses(socket: WebSocket) -> None:
     target, source = socket.path_params["target"], socket.path_params["source"]
-    # Programs that are no browsers send no origin.
+    # Programs other than browsers send no origin.
     origin = socket.headers.get("origin")
     if origin not in (None, f"http://{socket.headers.get('host')}", *ORIGINS):
         await socket.close()
         return
     await socket.accept()
-    # Whoever has gone is noticed at the next message.
+    # The service notices at the next message that a client has gone.
     with contextlib.suppress(WebSocketDisconnect):
         with buffer_of(socket).watch(target, source, max_rate=20.0) as watch:
             async for found in watch:

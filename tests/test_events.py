@@ -91,7 +91,7 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
     (PeerLost(AT, "tf", "5eed", (), ()), "peer 5eed is lost on tf: 0 frames"),
     (
         PeerRejected(AT, "tf", "5eed", "truncated", ValueError("ends\nearly")),
-        "peer 5eed on tf sent what was refused: ends\\nearly",
+        "peer 5eed on tf sent data that were refused: ends\\nearly",
     ),
     (RecordingDropped(AT, "run.mcap", 7), "the recording run.mcap is behind and loses samples, 7 so far"),
     (RecordingFailed(AT, "run.mcap", OSError("disk\nfull")), "the recording run.mcap has ended early: disk\\nfull"),

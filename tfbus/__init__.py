@@ -95,7 +95,7 @@ _NAMES_IN = {
     "waiting.live_tree": ("PendingLookup",),
     "which_kernel": ("kernel",),
 }
-"""The public names by the module that each is in. `__init__.pyi` says the same to type checkers, as imports."""
+"""The public names by module. `__init__.pyi` has the same as imports, for type checkers."""
 
 _HOMES = {name: module for module, names in _NAMES_IN.items() for name in names}
 _ROOMS = ("analysis", "data", "recording", "robot", "testing")

@@ -1,7 +1,7 @@
 """The build hook: it compiles the kernel where there is a C compiler.
 
-Without one the wheel is pure, and the Python twin of the kernel runs. Hatchling calls `Hook`; the compiler runs in a
-process of its own, so that whatever it prints stays out of the way of an installation that does not need it.
+Without a compiler the wheel is pure, and the Python twin of the kernel runs. Hatchling calls `Hook`. The compiler runs
+in a process of its own, so that its output does not disturb an installation that does not need it.
 """
 
 import shutil
@@ -23,7 +23,7 @@ class Hook(BuildHookInterface[Any]):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile the kernel before the wheel is built."""
         self._folder = Path(tempfile.mkdtemp())
-        # The stable ABI is CPython's, and that of free-threaded builds is another one.
+        # The stable ABI is CPython's, and free-threaded builds have another one.
         if sys.implementation.name != "cpython" or sysconfig.get_config_var("Py_GIL_DISABLED"):
             return
         command = [sys.executable, str(Path(__file__).resolve()), str(self._folder)]
@@ -40,7 +40,7 @@ class Hook(BuildHookInterface[Any]):
         build_data["tag"] = f"cp311-abi3-{sysconfig.get_platform().replace('-', '_').replace('.', '_')}"
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:  # noqa: ARG002
-        """Remove what was compiled for the wheel."""
+        """Remove the kernel that was compiled for the wheel."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
 

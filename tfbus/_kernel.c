@@ -2,12 +2,12 @@
  *
  * The Python twins, which tfbus/_kernel.pyi names, are its definition. Both give the same bits, so every sum below is
  * added in the order of tfbus/rows.py, and the compiler must not fuse a multiplication with an addition
- * (-ffp-contract=off). Whatever is not plain is handed back: None, False or a count says so, and Python decides. There
- * is no policy and no text of a transform error here.
+ * (-ffp-contract=off). A case that is not plain is handed back to Python by None, False or a count. There is no policy
+ * and no text of a transform error here.
  *
- * No function that touches a history runs Python code, allocates an object that the garbage collector tracks or lets
- * go of the interpreter's lock in between, so that other threads see each call as one step. Only the answers at many
- * stamps are made without that lock, from blocks that nobody changes while they have a reader.
+ * While a function touches a history, it runs no Python code, allocates no object that the garbage collector tracks,
+ * and keeps the interpreter's lock, so other threads see each call as one step. Only the answers at many stamps are
+ * made without that lock, from blocks that nobody changes while they have a reader.
  */
 #ifndef Py_LIMITED_API
 #define Py_LIMITED_API 0x030b0000
@@ -38,7 +38,8 @@
 enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quaternion x, y, z, w */
 #define ROW_SIZE (WIDTH * sizeof(double))
 #define SAMPLE_SIZE (sizeof(int64_t) + ROW_SIZE)
-#define EXACT_GAP ((uint64_t)1 << 53) /* ns; beyond, a difference of stamps is no exact float, and Python divides */
+#define ROUNDING 1e-15 /* as in tfbus.rows */
+#define EXACT_GAP ((uint64_t)1 << 53) /* ns; a greater difference of stamps is inexact as a float, and Python divides */
 
 static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
 static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType, *MethodType;
@@ -50,7 +51,7 @@ static const double identity[WIDTH] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0};
 
 /* References ------------------------------------------------------------------------------------------------------- */
 
-/* What the garbage collector needs of a type whose first fields are references: `fields` of them. */
+/* The functions for the garbage collector of a type whose first fields are references: `fields` of them. */
 #define REFERENCES(name, fields)                                                                        \
     static int name##_traverse(PyObject *self, visitproc visit, void *arg)                              \
     {                                                                                                   \
@@ -179,8 +180,8 @@ read_stamp(PyObject *number, int64_t *stamp)
     return 0;
 }
 
-/* As `read_stamp`, for a question about stored samples, which may be beyond all stamps: the sum of a stamp and a duration.
- * Then `*beyond` is the side, 1 or -1, else 0. */
+/* As `read_stamp`, for a question about stored samples. The sum of a stamp and a duration may be beyond all stamps:
+ * then `*beyond` is the side, 1 or -1, else 0. */
 static int
 read_instant(PyObject *number, int64_t *stamp, int *beyond)
 {
@@ -326,7 +327,7 @@ sample_fields(Sample *self, void *Py_UNUSED(closure))
         if (row != NULL && stamp != NULL) {
             PyObject *is_static = self->is_static ? Py_True : Py_False;
             PyObject *made = PyTuple_Pack(6, self->parent, self->child, stamp, row, self->authority, is_static);
-            /* The garbage collector may have let another thread make it. */
+            /* While the garbage collector ran, another thread may have made it. */
             if (self->fields == NULL) {
                 self->fields = made;
             } else {
@@ -431,8 +432,8 @@ static PyType_Spec sample_spec = {
 
 /* Block: the memory of a history ----------------------------------------------------------------------------------- */
 
-/* The stamps of all samples, then their rows. A reader may read the samples that there were when it came: while a block
- * has readers, its history only adds behind them, and takes another block for every other change. */
+/* The stamps of all samples, then their rows. A reader reads the samples that the block had when the reading began.
+ * While a block has readers, its history only appends samples, and takes another block for every other change. */
 typedef struct {
     PyObject_VAR_HEAD
     Py_ssize_t readers; /* how many read it besides its history */
@@ -496,7 +497,7 @@ static PyType_Spec block_spec = {
 
 typedef struct {
     PyObject_HEAD
-    PyObject *parent, *authority; /* plain str: those of the newest sample */
+    PyObject *parent, *authority; /* plain str, of the newest sample */
     Block *block;                 /* NULL until there is a sample */
     Py_ssize_t start, end;        /* the samples in the window */
     int64_t keep;                 /* ns; -1 for ever */
@@ -519,7 +520,7 @@ lower_bound(const int64_t *stamps, Py_ssize_t count, int64_t at)
 {
     Py_ssize_t low = 0;
     if (count > 16 && stamps[0] < at && at < stamps[count - 1]) {
-        /* Samples mostly come at a steady rate: look where the stamp would then be. */
+        /* Samples mostly come at a steady rate: look first at the place that a steady rate gives. */
         const double part = (double)((uint64_t)at - (uint64_t)stamps[0]);
         const double whole = (double)((uint64_t)stamps[count - 1] - (uint64_t)stamps[0]);
         const Py_ssize_t guess = (Py_ssize_t)(part / whole * (double)(count - 1));
@@ -599,7 +600,7 @@ history_push(History *self, int64_t stamp, const double *row)
     return 0;
 }
 
-/* Forget what has left the window. */
+/* Forget the samples that have left the window. */
 static void
 history_slide(History *self)
 {
@@ -1028,12 +1029,12 @@ static PyMethodDef history_methods[] = {
      PyDoc_STR("put(index, stamp, row): store a sample before another, or in its place if the stamps are equal.")},
     {"find", (PyCFunction)history_find, METH_O, PyDoc_STR("find(stamp): the index of the first sample not before it.")},
     {"between", FAST(history_between), METH_FASTCALL,
-     PyDoc_STR("between(low, high): the index of the last sample up to a stamp, and that behind the first from one on.")},
+     PyDoc_STR("between(low, high): the index of the last sample up to `low`, and behind the first from `high` on.")},
     {"stamp", (PyCFunction)history_stamp, METH_O, PyDoc_STR("stamp(index): the stamp of a sample.")},
     {"sample", (PyCFunction)history_sample, METH_O, PyDoc_STR("sample(index): the stamp and the row of a sample.")},
     {"row", (PyCFunction)history_row, METH_O, PyDoc_STR("row(at): the row at a stamp; None if it is not plain.")},
     {"clear", (PyCFunction)history_clear, METH_NOARGS, PyDoc_STR("Forget all samples.")},
-    {"take", (PyCFunction)history_take, METH_O, PyDoc_STR("take(other): hold a copy of the samples of another.")},
+    {"take", (PyCFunction)history_take, METH_O, PyDoc_STR("take(other): hold a copy of another history's samples.")},
     {"columns", FAST(history_columns), METH_FASTCALL,
      PyDoc_STR("columns(first, end, wanted=None): the memory of some samples, which nothing changes while it is held.")},
     {NULL}
@@ -1047,7 +1048,7 @@ static PyGetSetDef history_getset[] = {
     {"oldest", (getter)history_oldest, NULL, PyDoc_STR("The oldest stamp in the window, or None."), NULL},
     {"newest", (getter)history_newest, NULL, PyDoc_STR("The newest stamp, or None."), NULL},
     {"newest_record", (getter)history_newest_record, NULL,
-     PyDoc_STR("The newest stamp and its row, 64 bytes; none if there is no moving sample."), NULL},
+     PyDoc_STR("The newest stamp and its row, 64 bytes; empty if there is no moving sample."), NULL},
     {"horizon", (getter)history_horizon, NULL, PyDoc_STR("Samples before this stamp have left the window."), NULL},
     {NULL}
 };
@@ -1084,7 +1085,7 @@ typedef struct {
 /* The two samples round a stamp. */
 typedef struct {
     int64_t before, after;
-    const double *a, *b; /* their rows; `a` is NULL if the stamp is that of `b` */
+    const double *a, *b; /* their rows; `a` is NULL if `b` has the stamp */
 } Segment;
 
 /* The rotation from one sample to the next: tfbus.rows.interpolate up to the fraction. */
@@ -1126,7 +1127,7 @@ find_segment(const Samples *samples, int64_t at, Segment *segment)
 
 enum { LANES = 32 }; /* rows that are made at once */
 
-/* Step by step for all, because the steps of one row wait for each other, and those of several rows do not. */
+/* Each step for all rows, because the steps of one row depend on each other, and the rows do not. */
 static void
 find_turns(const Segment *segments, Turn *turns, Py_ssize_t count)
 {
@@ -1149,8 +1150,8 @@ find_turns(const Segment *segments, Turn *turns, Py_ssize_t count)
     }
 }
 
-/* The rows of `count` lanes, of which the one numbered i lies in segments[which[i]] at stamps[i]. The next lane is
- * `lane_step` floats on in `out`, the next float of the same row `float_step`. */
+/* The rows of `count` lanes; lane i lies in segments[which[i]] at stamps[i]. In `out`, the next lane is `lane_step`
+ * floats on, and the next float of the same row `float_step`. */
 static inline void
 blend(const Segment *segments, const Turn *turns, const unsigned char *which, const int64_t *stamps, Py_ssize_t count,
       double *out, Py_ssize_t lane_step, Py_ssize_t float_step)
@@ -1386,11 +1387,11 @@ chain_latest(Chain *self, PyObject *Py_UNUSED(ignored))
 
 /* Held: the samples of a chain as they were at one moment, for many answers ----------------------------------------- */
 
-/* What is known of each step of a chain, of static ones nothing. */
+/* The state of each step of a chain; empty for static ones. */
 typedef struct {
     Samples samples;
     Segment last; /* the segment that was used last, which holds for all stamps between its two; none if equal */
-    Turn turn;    /* that of `last` */
+    Turn turn;    /* the turn of `last` */
     Block *block; /* which it reads, or NULL */
 } Seen;
 
@@ -1399,7 +1400,7 @@ typedef struct {
     Chain *chain;
     Seen *seen; /* one a step */
     Py_ssize_t count; /* of these; the garbage collector may have cleared the chain before this ends */
-    char busy;  /* whether a thread is at work on what is seen */
+    char busy;  /* whether a thread works on `seen` */
 } Held;
 
 /* Note the samples of each edge as they are now; NULL without an error if an edge is not plain. */
@@ -1425,7 +1426,7 @@ chain_look(const Chain *self)
     return seen;
 }
 
-/* Keep others from changing what was seen, until `let_go`. */
+/* Keep others from changing the samples that were noted, until `let_go`. */
 static void
 keep_hold(const Chain *chain, Seen *seen)
 {
@@ -1463,7 +1464,7 @@ fill_row(const double *row, Column *out, Py_ssize_t count)
     }
 }
 
-/* The rows of an edge at some stamps. Where there is none, `missing` is set and the row is any. */
+/* The rows of an edge at some stamps. Where there is none, `missing` is set and the row is meaningless. */
 static Status
 edge_rows(Seen *edge, const int64_t *stamps, Py_ssize_t count, Column *out, char *missing)
 {
@@ -1566,7 +1567,7 @@ fill_columns(const Chain *self, Seen *seen, const char *stamps, Py_ssize_t count
     return first_missing;
 }
 
-enum { FEW_STAMPS = 256 }; /* letting go of the interpreter costs more than so many */
+enum { FEW_STAMPS = 256 }; /* for fewer answers, releasing the interpreter costs more than it gains */
 
 /* As `fill_columns`, of samples that others may not change: see Block. */
 static Py_ssize_t
@@ -1697,7 +1698,7 @@ static PyMethodDef chain_methods[] = {
     {"latest", (PyCFunction)chain_latest, METH_NOARGS,
      PyDoc_STR("The newest stamp that all edges have reached; None if one has no samples, or nothing moves.")},
     {"hold", (PyCFunction)chain_hold, METH_NOARGS,
-     PyDoc_STR("The samples of all edges as they are now, for many answers; None if they are not plain.")},
+     PyDoc_STR("The present samples of all edges, for many answers; None if they are not plain.")},
     {NULL}
 };
 
@@ -1809,8 +1810,8 @@ typedef struct {
     long long version;       /* another one after each change */
 } Paths;
 
-/* Whether nobody holds the lock: whoever does may be in the middle of a change, or of a look at several histories. As
- * nothing here lets go of the interpreter, it need not be taken then. -1 for an error. */
+/* Whether nobody holds the lock. Its holder may be in the middle of a change, or of reading several histories. Nothing
+ * here lets go of the interpreter, so a free lock need not be taken. -1 for an error. */
 static int
 paths_are_free(const Paths *self)
 {
@@ -1926,7 +1927,7 @@ room_for_rows(PyObject *stamps)
     if (is_list || is_tuple) {
         count = is_list ? PyList_Size(stamps) : PyTuple_Size(stamps);
     } else {
-        /* Whatever has a mask is for Python to judge. */
+        /* Python judges arrays with a mask. */
         if (OBJECT(Py_TYPE(stamps)) != array_type
             && (!PyObject_CheckBuffer(stamps) || PyObject_HasAttrString(stamps, "mask"))) {
             return NULL;
@@ -2003,7 +2004,7 @@ paths_answer_many(Paths *self, PyObject *const *args, Py_ssize_t nargs)
     return memory;
 }
 
-/* commit(frames, readers, batch): store the whole batch if it is plain, nobody holds the lock and nobody has to be told. */
+/* commit(frames, readers, batch): store the whole batch if it is plain, the lock is free and there are no readers. */
 static PyObject *
 paths_commit(Paths *self, PyObject *const *args, Py_ssize_t nargs)
 {
@@ -2063,7 +2064,7 @@ static PyMethodDef paths_methods[] = {
      PyDoc_STR("answer_many(target, source, stamps): the plain answers as bytes, seven columns of floats, and the stamps; "
                "None if Python has to look closer.")},
     {"commit", FAST(paths_commit), METH_FASTCALL,
-     PyDoc_STR("commit(frames, readers, batch): store a batch if all of it is plain and nobody looks; else nothing.")},
+     PyDoc_STR("commit(frames, readers, batch): store a batch if it is plain and has no readers; else nothing.")},
     {NULL}
 };
 
@@ -2141,7 +2142,7 @@ method_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
     return OBJECT(self);
 }
 
-/* The plain answer to whoever asks for source in target; None if there is none. Without stamps it is the latest. */
+/* The plain answer for source in target; None if there is none. Without stamps it is the latest. */
 static PyObject *
 method_answer(const Method *self, PyObject *asker, PyObject *target, PyObject *source, PyObject *at)
 {
@@ -2205,7 +2206,7 @@ method_has_defaults(const Method *self, PyObject *const *named, PyObject *names,
     return 1;
 }
 
-/* By PEP 590. Plain are only the object, target, source, and the stamp or stamps; other arguments are defaults. */
+/* By PEP 590. A plain call has only the object, target, source, and the stamp or stamps; all else are defaults. */
 static PyObject *
 method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject *names)
 {
@@ -2241,7 +2242,7 @@ method_bind(PyObject *self, PyObject *instance, PyObject *Py_UNUSED(owner))
     return PyObject_CallFunctionObjArgs(bound_method, self, instance, NULL);
 }
 
-/* It looks like the method in Python, so that its signature and its documentation are found. */
+/* Attributes come from the method in Python, so that its signature and its documentation are found. */
 static PyObject *
 method_attribute(Method *self, PyObject *name)
 {
@@ -2286,7 +2287,7 @@ typedef struct {
     PyObject *trusted; /* plain str, or NULL for nobody */
     int64_t newest;
     char has_newest;
-    char late; /* whether old stamps of it were told */
+    char late; /* whether its old stamps were reported */
 } Edge;
 
 static PyObject *
@@ -2348,12 +2349,12 @@ static PyGetSetDef edge_getset[] = {
 };
 
 static PyMemberDef edge_members[] = {
-    {"late", T_BOOL, offsetof(Edge, late), 0, PyDoc_STR("Whether its old stamps were told, so that they are plain.")},
+    {"late", T_BOOL, offsetof(Edge, late), 0, PyDoc_STR("Whether its old stamps were reported.")},
     {NULL}
 };
 
 static PyType_Slot edge_slots[] = {
-    {Py_tp_doc, (void *)PyDoc_STR("The part of a frame's newest edge by which its samples are judged.")},
+    {Py_tp_doc, (void *)PyDoc_STR("The part of a frame's newest edge that the judge needs.")},
     {Py_tp_new, PyType_GenericNew},
     {Py_tp_dealloc, edge_dealloc},
     {Py_tp_members, edge_members},
@@ -2414,7 +2415,7 @@ judge_init(Judge *self, PyObject *args, PyObject *kwargs)
     return 0;
 }
 
-/* allow(earliest, horizon, lasting): set both for so many ns of the machine's time; then no batch is plain. */
+/* allow(earliest, horizon, lasting): set both for `lasting` ns of the machine's time; after that, no batch is plain. */
 static PyObject *
 judge_allow(Judge *self, PyObject *args)
 {
@@ -2471,14 +2472,17 @@ judge_accepts(Judge *self, PyObject *batch)
         }
     }
     const int plain = judged == size;
+    const int64_t earliest = self->earliest;
+    long long behind = 0;
     for (Py_ssize_t i = 0; plain && i < size; i++) {
         const int64_t stamp = ((const Sample *)PyTuple_GetItem(batch, i))->stamp;
         if (!edges[i]->has_newest || stamp > edges[i]->newest) {
             edges[i]->newest = stamp;
             edges[i]->has_newest = 1;
         }
-        self->behind += stamp < self->earliest;
+        behind += stamp < earliest;
     }
+    self->behind += behind;
     if (edges != few) {
         PyMem_Free(edges);
     }
@@ -2492,14 +2496,14 @@ static PyMethodDef judge_methods[] = {
     {"accepts", (PyCFunction)judge_accepts, METH_O,
      PyDoc_STR("accepts(batch): whether the whole batch is plain; then its stamps are noted.")},
     {"allow", (PyCFunction)judge_allow, METH_VARARGS,
-     PyDoc_STR("allow(earliest, horizon, lasting): set both for so many ns of the machine's time.")},
+     PyDoc_STR("allow(earliest, horizon, lasting): set both for `lasting` ns of the machine's time.")},
     {NULL}
 };
 
 static PyMemberDef judge_members[] = {
     {"behind", T_LONGLONG, offsetof(Judge, behind), 0, PyDoc_STR("How many stamps were older than the first bound.")},
-    {"earliest", T_LONGLONG, offsetof(Judge, earliest), 0, PyDoc_STR("No stamp but of late edges may be older, in ns.")},
-    {"horizon", T_LONGLONG, offsetof(Judge, horizon), 0, PyDoc_STR("No stamp may be newer, in ns.")},
+    {"earliest", T_LONGLONG, offsetof(Judge, earliest), 0, PyDoc_STR("The oldest accepted stamp but of late edges.")},
+    {"horizon", T_LONGLONG, offsetof(Judge, horizon), 0, PyDoc_STR("The newest accepted stamp in ns.")},
     {NULL}
 };
 
@@ -2526,9 +2530,9 @@ typedef struct {
     PyObject *plain;   /* target, source and at of a plain question; None of another */
     PyObject *wake;    /* called without arguments, once */
     PyObject *place;   /* its place in a line, if it has one */
-    PyObject *answer;  /* that of whoever woke it */
+    PyObject *answer;  /* the answer of the insertion that woke it */
     long long version; /* of the paths, when they had this answer */
-    char elsewhere;    /* whether it is noted elsewhere than in a line and among all that are parked */
+    char elsewhere;    /* whether it is noted elsewhere than in a line and among all parked lookups */
 } Parked;
 
 REFERENCES(parked, 4)
@@ -2537,14 +2541,14 @@ static PyMemberDef parked_members[] = {
     {"plain", T_OBJECT, offsetof(Parked, plain), 0, PyDoc_STR("Target, source and at of a plain question, or None.")},
     {"wake", T_OBJECT, offsetof(Parked, wake), 0, PyDoc_STR("Called once, after it was taken out of its line.")},
     {"place", T_OBJECT, offsetof(Parked, place), 0, PyDoc_STR("Its place in a line, or None.")},
-    {"answer", T_OBJECT, offsetof(Parked, answer), 0, PyDoc_STR("The answer that whoever woke it has found, or None.")},
-    {"version", T_LONGLONG, offsetof(Parked, version), 0, PyDoc_STR("That of the paths which had this answer.")},
+    {"answer", T_OBJECT, offsetof(Parked, answer), 0, PyDoc_STR("The answer of the insertion that woke it, or None.")},
+    {"version", T_LONGLONG, offsetof(Parked, version), 0, PyDoc_STR("The version of the paths that gave this answer.")},
     {"elsewhere", T_BOOL, offsetof(Parked, elsewhere), 0, PyDoc_STR("Whether more than its line has to forget it.")},
     {NULL}
 };
 
 static PyType_Slot parked_slots[] = {
-    {Py_tp_doc, (void *)PyDoc_STR("The part of a parked lookup by which it is woken.")},
+    {Py_tp_doc, (void *)PyDoc_STR("The part of a parked lookup that a wake-up needs.")},
     {Py_tp_new, PyType_GenericNew},
     {Py_tp_dealloc, parked_dealloc},
     {Py_tp_traverse, parked_traverse},
@@ -2561,7 +2565,7 @@ static PyType_Spec parked_spec = {
 typedef struct {
     PyObject_HEAD
     PyObject *places;  /* list of (-stamp, -order, Parked), sorted: the next due is the last */
-    PyObject *for_any; /* dict of those that any sample wakes */
+    PyObject *for_any; /* dict of the lookups that any sample wakes */
     PyObject *limits;  /* list of (-stamp, -order, Parked), sorted */
 } Line;
 
@@ -2588,9 +2592,9 @@ line_has_places_only(const Line *self)
 }
 
 static PyMemberDef line_members[] = {
-    {"places", T_OBJECT_EX, offsetof(Line, places), READONLY, PyDoc_STR("Those that need a stamp, the next due last.")},
-    {"for_any", T_OBJECT_EX, offsetof(Line, for_any), READONLY, PyDoc_STR("Those that any sample wakes.")},
-    {"limits", T_OBJECT_EX, offsetof(Line, limits), READONLY, PyDoc_STR("Those that a newer stamp wakes.")},
+    {"places", T_OBJECT_EX, offsetof(Line, places), READONLY, PyDoc_STR("Lookups that need a stamp, the next due last.")},
+    {"for_any", T_OBJECT_EX, offsetof(Line, for_any), READONLY, PyDoc_STR("The lookups that any sample wakes.")},
+    {"limits", T_OBJECT_EX, offsetof(Line, limits), READONLY, PyDoc_STR("The lookups that a newer stamp wakes.")},
     {NULL}
 };
 
@@ -2656,8 +2660,8 @@ is_reached(PyObject *place, int64_t stamp)
     return overflow > 0 || (overflow == 0 && (stamp != INT64_MIN && negative >= -stamp));
 }
 
-/* Whether the wake-ups of a batch are plain: nobody watches its frames or waits for them but those that need a stamp, and
- * no sample has passed the first limit. -1 for an error. */
+/* Whether the wake-ups of a batch are plain: only lookups that need a stamp wait for its frames, nobody watches them,
+ * and no sample has passed the first limit. -1 for an error. */
 static int
 feed_is_plain(const Feed *self, PyObject *batch)
 {
@@ -2726,7 +2730,7 @@ feed_pop(PyObject *lines, PyObject *child, Line *line, Py_ssize_t last)
 {
     PyObject *item = PyTuple_GetItem(PyList_GetItem(line->places, last), 2);
     if (!PyObject_TypeCheck(item, ParkedType)) {
-        PyErr_SetString(PyExc_TypeError, "only what is parked has a place");
+        PyErr_SetString(PyExc_TypeError, "only a parked lookup has a place");
         return NULL;
     }
     Py_INCREF(item);
@@ -2764,8 +2768,8 @@ feed_answer(const Feed *self, Parked *waiter)
     Py_DECREF(plain);
 }
 
-/* Wake those that a sample at a stamp has unblocked, each with its answer if that is plain. An error of one keeps no
- * other from being woken. */
+/* Wake the lookups that a sample at a stamp has unblocked, each with its answer if that is plain. After an error of
+ * one, the others are woken too. */
 static void
 feed_wake(const Feed *self, PyObject *child, int64_t stamp, Trouble *trouble)
 {
@@ -2823,7 +2827,7 @@ feed_wake(const Feed *self, PyObject *child, int64_t stamp, Trouble *trouble)
     }
 }
 
-/* insert(batch): store a batch and wake those that it has unblocked, if all of that is plain; else do nothing. */
+/* insert(batch): store a batch and wake the lookups that it has unblocked, if all of this is plain; else do nothing. */
 static PyObject *
 feed_insert(Feed *self, PyObject *batch)
 {
@@ -2862,7 +2866,7 @@ feed_insert(Feed *self, PyObject *batch)
 
 static PyMethodDef feed_methods[] = {
     {"insert", (PyCFunction)feed_insert, METH_O,
-     PyDoc_STR("insert(batch): store a batch and wake those that it has unblocked, if all of it is plain; else do "
+     PyDoc_STR("insert(batch): store a batch and wake the lookups that it has unblocked, if all is plain; else do "
                "nothing.")},
     {NULL}
 };
@@ -2890,7 +2894,7 @@ typedef struct {
     PyObject *feeds;
     PyObject *judge;      /* Judge */
     PyObject *kind;       /* the class of samples */
-    PyObject *listeners;  /* a tuple of containers; whatever is in one has to hear of each batch */
+    PyObject *listeners;  /* a tuple of containers; their elements need each batch */
     long long samples;    /* how many were taken */
     unsigned long thread; /* the only one that may publish */
     char open;
@@ -2926,7 +2930,7 @@ intake_init(Intake *self, PyObject *args, PyObject *kwargs)
     return 0;
 }
 
-/* A batch of samples of exactly the class; NULL without an error if it is anything else. */
+/* A batch of samples of exactly the class; NULL without an error for anything else. */
 static PyObject *
 intake_batch(const Intake *self, PyObject *samples)
 {
@@ -2992,13 +2996,12 @@ intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
     Py_INCREF(feeds);
     const Py_ssize_t count = PyTuple_Size(feeds);
     Trouble trouble = {NULL};
-    /* An error of one buffer keeps no other from the batch, which the bus has judged. */
+    /* After an error of one buffer, the others get the batch too, because the bus has judged it. */
     for (Py_ssize_t i = 0; i < count; i++) {
-        PyObject *pair = PyTuple_GetItem(feeds, i), *feed, *insert;
-        PyObject *done = PyArg_ParseTuple(pair, "O!O", FeedType, &feed, &insert) ? feed_insert((Feed *)feed, batch) : NULL;
+        PyObject *pair = PyTuple_GetItem(feeds, i), *done = feed_insert((Feed *)PyTuple_GetItem(pair, 0), batch);
         if (done == Py_False) {
             Py_DECREF(done);
-            done = PyObject_CallFunctionObjArgs(insert, batch, NULL);
+            done = PyObject_CallFunctionObjArgs(PyTuple_GetItem(pair, 1), batch, NULL);
         }
         if (done == NULL) {
             set_aside(&trouble);
@@ -3024,8 +3027,17 @@ intake_feeds(Intake *self, void *Py_UNUSED(closure))
 static int
 intake_set_feeds(Intake *self, PyObject *value, void *Py_UNUSED(closure))
 {
-    if (value == NULL || !PyTuple_CheckExact(value)) {
-        PyErr_SetString(PyExc_TypeError, "feeds must be a tuple");
+    Py_ssize_t pairs = 0;
+    const Py_ssize_t size = value != NULL && PyTuple_CheckExact(value) ? PyTuple_Size(value) : -1;
+    for (; pairs < size; pairs++) {
+        PyObject *pair = PyTuple_GetItem(value, pairs);
+        if (!PyTuple_CheckExact(pair) || PyTuple_Size(pair) != 2
+            || !PyObject_TypeCheck(PyTuple_GetItem(pair, 0), FeedType)) {
+            break;
+        }
+    }
+    if (pairs != size) {
+        PyErr_SetString(PyExc_TypeError, "feeds must be a tuple of pairs of a Feed and a callable");
         return -1;
     }
     PyObject *old = self->feeds;
@@ -3051,12 +3063,12 @@ static PyGetSetDef intake_getset[] = {
 static PyMemberDef intake_members[] = {
     {"samples", T_LONGLONG, offsetof(Intake, samples), 0, PyDoc_STR("The number of samples that were taken.")},
     {"thread", T_ULONG, offsetof(Intake, thread), 0, PyDoc_STR("The only thread that may publish.")},
-    {"open", T_BOOL, offsetof(Intake, open), 0, PyDoc_STR("Whether anything is taken.")},
+    {"open", T_BOOL, offsetof(Intake, open), 0, PyDoc_STR("Whether it takes batches.")},
     {NULL}
 };
 
 static PyType_Slot intake_slots[] = {
-    {Py_tp_doc, (void *)PyDoc_STR("The plain way of published samples into the buffers of a bus.")},
+    {Py_tp_doc, (void *)PyDoc_STR("The fast path of published samples into the buffers of a bus.")},
     {Py_tp_new, PyType_GenericNew},
     {Py_tp_init, intake_init},
     {Py_tp_dealloc, intake_dealloc},
@@ -3071,6 +3083,96 @@ static PyType_Slot intake_slots[] = {
 static PyType_Spec intake_spec = {
     "tfbus._kernel.Intake", sizeof(Intake), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC, intake_slots
 };
+
+/* Messages ---------------------------------------------------------------------------------------------------------- */
+
+/* A sample of a message whose names and tag are known; NULL with or without an error if it is not plain. */
+static PyObject *
+decoded_sample(PyTypeObject *kind, PyObject *names, PyObject *tag, int64_t stamp, const char *row)
+{
+    static PyObject *nothing;
+    if (nothing == NULL && (nothing = PyTuple_New(0)) == NULL) {
+        return NULL;
+    }
+    if (!PyTuple_Check(names) || PyTuple_Size(names) != 2 || !PyTuple_Check(tag) || PyTuple_Size(tag) != 2) {
+        return NULL;
+    }
+    PyObject *parent = PyTuple_GetItem(names, 0), *child = PyTuple_GetItem(names, 1);
+    PyObject *authority = PyTuple_GetItem(tag, 0);
+    if (!PyUnicode_CheckExact(parent) || !PyUnicode_CheckExact(child) || !PyUnicode_CheckExact(authority)) {
+        return NULL;
+    }
+    Sample *sample = (Sample *)((newfunc)PyType_GetSlot(kind, Py_tp_new))(kind, nothing, NULL);
+    if (sample == NULL) {
+        return NULL;
+    }
+    sample->parent = Py_NewRef(parent);
+    sample->child = Py_NewRef(child);
+    sample->authority = Py_NewRef(authority);
+    sample->stamp = stamp;
+    memcpy(sample->row, row, ROW_SIZE);
+    sample->is_static = PyTuple_GetItem(tag, 1) == Py_True;
+    return OBJECT(sample);
+}
+
+/* Decode the plain samples at the beginning of a message: little endian, with names that were decoded before. */
+static PyObject *
+decode(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 5 || !PyBytes_Check(args[0]) || !PyTuple_Check(args[2]) || !PyDict_Check(args[3])
+        || !PyType_Check(args[4]) || !PyType_IsSubtype((PyTypeObject *)args[4], SampleType)) {
+        PyErr_SetString(PyExc_TypeError, "decode takes bytes, an offset, tags, known names and a type of samples");
+        return NULL;
+    }
+    const char *body = PyBytes_AsString(args[0]);
+    const int64_t size = PyBytes_Size(args[0]);
+    int64_t at = PyLong_AsLongLong(args[1]);
+    const Py_ssize_t count = PyTuple_Size(args[2]);
+    PyObject *samples = at == -1 && PyErr_Occurred() ? NULL : PyList_New(0);
+    for (Py_ssize_t i = 0; samples != NULL && i < count; i++) {
+        int32_t seconds;
+        uint32_t nanoseconds, length;
+        double row[WIDTH];
+        if (at < 0 || at > size - 12) {
+            break;
+        }
+        memcpy(&seconds, body + at, 4);
+        memcpy(&nanoseconds, body + at + 4, 4);
+        memcpy(&length, body + at + 8, 4);
+        const int64_t middle = (at + 12 + length + 3) & -4;
+        if (middle > size - 4) {
+            break;
+        }
+        memcpy(&length, body + middle, 4);
+        const int64_t end = (middle + 4 + length + 7) & -8;
+        if (end > size - (int64_t)ROW_SIZE) {
+            break;
+        }
+        memcpy(row, body + end, ROW_SIZE);
+        const double off = row[3] * row[3] + row[4] * row[4] + row[5] * row[5] + row[6] * row[6] - 1.0;
+        /* Zero times a number that is not finite is NaN. */
+        if (!(off >= -ROUNDING && off <= ROUNDING) || !((row[0] + row[1] + row[2]) * 0.0 == 0.0)
+            || nanoseconds >= 1000000000) {
+            break;
+        }
+        PyObject *piece = PyBytes_FromStringAndSize(body + at + 8, (Py_ssize_t)(end - at - 8));
+        PyObject *names = piece == NULL ? NULL : PyDict_GetItemWithError(args[3], piece);
+        Py_XDECREF(piece);
+        PyObject *sample = names == NULL ? NULL
+                                         : decoded_sample((PyTypeObject *)args[4], names, PyTuple_GetItem(args[2], i),
+                                                          (int64_t)seconds * 1000000000 + nanoseconds, body + end);
+        if (sample == NULL || PyList_Append(samples, sample) < 0) {
+            Py_XDECREF(sample);
+            if (PyErr_Occurred()) {
+                Py_CLEAR(samples);
+            }
+            break;
+        }
+        Py_DECREF(sample);
+        at = end + (int64_t)ROW_SIZE;
+    }
+    return samples == NULL ? NULL : Py_BuildValue("(NL)", samples, (long long)at);
+}
 
 /* The module -------------------------------------------------------------------------------------------------------- */
 
@@ -3105,7 +3207,10 @@ compose_paths(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nar
 
 static PyMethodDef module_methods[] = {
     {"compose_paths", FAST(compose_paths), METH_FASTCALL,
-     PyDoc_STR("compose_paths(rows, origins): make each row, seen from its origin, one seen from the first place.")},
+     PyDoc_STR("compose_paths(rows, origins): make every pose relative to the first one.")},
+    {"decode", FAST(decode), METH_FASTCALL,
+     PyDoc_STR("decode(body, at, tags, names, kind): the samples of a message up to the first that is not plain, and "
+               "its offset.")},
     {"commit", FAST(commit), METH_FASTCALL,
      PyDoc_STR("commit(frames, batch, first): store the samples from `first` to the first that is not plain; its "
                "index.")},

@@ -15,13 +15,15 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from math import acos, sin, sqrt
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from tfbus.rows import IDENTITY, Row, compose, invert
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps
+
+SampleT = TypeVar("SampleT", bound="Sample")
 
 
 class Sample:
@@ -67,7 +69,7 @@ class Sample:
 
 
 class Edge:
-    """The part of a frame's newest edge by which its samples are judged.
+    """The part of a frame's newest edge that the judge needs.
 
     Attributes
     ----------
@@ -77,7 +79,7 @@ class Edge:
     newest : int or None
         The newest stamp, in ns.
     late : bool
-        Whether it was told that its stamps are behind the clock, so that they need no judgement.
+        Whether its stamps were already reported as behind the clock, so that they need no judgement.
     """
 
     __slots__ = ("late", "newest", "parent", "trusted")
@@ -95,14 +97,15 @@ class Judge:
     edges : dict of str to Edge
         By child.
     square : float
-        No translation may have a greater square, in m^2.
+        The greatest square of a translation, in m^2.
 
     Attributes
     ----------
     earliest, horizon : int
-        No stamp may be older, but of late edges, or newer, in ns. At first both are the least stamp.
+        The oldest stamp, except for late edges, and the newest stamp that are accepted, in ns. At first both are the
+        least stamp.
     behind : int
-        Number of stamps that were older.
+        Number of accepted stamps that were older than `earliest`.
     """
 
     __slots__ = ("_edges", "_square", "_until", "behind", "earliest", "horizon")
@@ -115,12 +118,12 @@ class Judge:
         self.behind = 0
 
     def allow(self, earliest: int, horizon: int, lasting: int, /) -> None:
-        """Set `earliest` and `horizon` for so many ns of the machine's time; then no batch is plain."""
+        """Set `earliest` and `horizon` for `lasting` ns of the machine's time; after that, no batch is plain."""
         self.earliest, self.horizon = earliest, horizon
         self._until = min(time.monotonic_ns() + lasting, STAMP_MAX)
 
     def accepts(self, batch: Sequence[Sample]) -> bool:
-        """Whether a whole batch continues known edges; then the newest stamps are noted, else nothing."""
+        """Whether a whole batch continues known edges. If so, note the newest stamps; otherwise note nothing."""
         if self._until != STAMP_MAX and time.monotonic_ns() >= self._until:
             return False
         edges, square, earliest, horizon = self._edges, self._square, self.earliest, self.horizon
@@ -138,7 +141,7 @@ class Judge:
             if not x * x + y * y + z * z <= square:
                 return False
         if len(batch) == 1:
-            # Nearly always so, and a second look costs a quarter of the first.
+            # The usual case; looking `known` up again costs a quarter of the first time.
             self.behind += stamp < earliest
             if known.newest is None or stamp > known.newest:
                 known.newest = stamp
@@ -157,7 +160,7 @@ Place = tuple[int, int, Any]
 
 
 class Parked:
-    """The part of a parked lookup by which it is woken.
+    """The part of a parked lookup that a wake-up needs.
 
     Attributes
     ----------
@@ -172,7 +175,7 @@ class Parked:
     version : int
         The version of the paths that gave this answer.
     elsewhere : bool
-        Whether more than its line, and the dict of all that are parked, has to forget it.
+        Whether its wake-up has to remove it from more than its line and the dict of all parked lookups.
     """
 
     __slots__ = ("answer", "elsewhere", "place", "plain", "version", "wake")
@@ -206,11 +209,12 @@ class Line:
 
 
 def compose_paths(rows: npt.NDArray[np.float64], origins: npt.NDArray[np.int64]) -> None:
-    """Replace each row, which is seen from the place of its origin, by the one that is seen from the first place.
+    """Make every pose relative to the first one.
 
     Parameters
     ----------
     rows : contiguous array of shape (n, 7)
+        Each pose relative to the pose at its origin; changed in place.
     origins : int64 array of shape (n,)
         The place of each origin, which comes before; 0 leaves a row as it is.
 
@@ -256,7 +260,7 @@ class History:
     parent, authority : str
         Of the newest sample.
     mixed : bool
-        Whether the samples name several parents. Then nothing about them is plain.
+        Whether the samples name several parents. Then no answer is plain.
     horizon : int
         Samples with a stamp before this one, in ns, have left the window.
     stamps : array of int
@@ -309,11 +313,11 @@ class History:
 
     @property
     def newest_record(self) -> bytes:
-        """The newest stamp (int64, ns) and its row (seven float64), 64 bytes; none if there is no moving sample."""
+        """The newest stamp (int64, ns) and its row (seven float64), 64 bytes; empty if there is no moving sample."""
         return bytes(self.records[-_SIZE:])
 
     def append(self, parent: str, stamp: int, row: Row, authority: str) -> bool:
-        """Store a sample that is newer and has the same parent and authority, as nearly all; else do nothing."""
+        """Store a sample if it is newer and has the same parent and authority, as usual; otherwise do nothing."""
         stamps = self.stamps
         # The horizon goes with the newest stamp, which takes longer to read.
         horizon = stamp - self._keep
@@ -357,7 +361,7 @@ class History:
         self._add(records.data.cast("B"), stamps.tobytes())
 
     def put(self, index: int, stamp: int, row: Row) -> None:
-        """Store a sample before the one at an index, or in its place if it has the same stamp."""
+        """Store a sample before the sample at an index, or in its place if both have the same stamp."""
         record = _pack(stamp, *row)
         at = self._start + index
         replaces = self.stamps[at] == stamp
@@ -376,9 +380,9 @@ class History:
         return bisect_left(self.stamps, stamp, start) - start
 
     def between(self, low: int, high: int) -> tuple[int, int]:
-        """The index of the last sample up to stamp `low`, and that behind the first sample from stamp `high` on.
+        """The index of the last sample up to stamp `low`, and the index behind the first sample from stamp `high` on.
 
-        Where there is no such sample, the first sample and the end of all.
+        If there is no such sample, the index of the first sample, and the end of all.
         """
         stamps, start = self.stamps, self._start
         first = bisect_right(stamps, low, start) - 1
@@ -424,7 +428,7 @@ class History:
     def columns(self, first: int, end: int, wanted: Stamps | None = None) -> Columns:
         """The memory of the samples from one index to another, which nothing changes while it is held.
 
-        Samples that are next to none of the `wanted` stamps (ns) may be left out.
+        Samples that are not next to a `wanted` stamp (ns) may be left out.
         """
         start = self._start
         begin, end = start + first, min(start + end, len(self.stamps))
@@ -449,7 +453,7 @@ class History:
             self._cut()
 
     def _settle(self) -> None:
-        """Have no more records than stamps, even if no memory or Ctrl-C came between, and the horizon of the newest."""
+        """Set the horizon, and drop surplus records, which a lack of memory or Ctrl-C may have left without a stamp."""
         del self.records[len(self.stamps) * _SIZE :]
         self.horizon = self.stamps[-1] - self._keep if self.stamps else STAMP_MIN
 
@@ -470,8 +474,8 @@ Step = History | Row
 def climb(steps: tuple[Step, ...], at: int) -> Row | None:
     """The first step's child, seen from the last step's parent, at a stamp; None if an edge has no plain answer.
 
-    It composes what each edge interpolates, by the formulas of `tfbus.rows` and with the same bits. One loop,
-    because a function call or a small array for each edge would cost more than its arithmetic.
+    It interpolates each edge and composes the results, by the formulas of `tfbus.rows` and with the same bits. It is
+    one loop, because a function call or a small array for each edge would cost more than its arithmetic.
     """
     if not steps:
         return IDENTITY
@@ -487,7 +491,7 @@ def climb(steps: tuple[Step, ...], at: int) -> Row | None:
                     step.records, i * _SIZE - _SIZE
                 )
             except struct.error:
-                # There is no pair round the first stamp, nor beyond the last.
+                # No two samples surround the first stamp, or a stamp beyond the last.
                 if i or not stamps or at != stamps[0] or at < step.horizon or step.mixed:
                     return None
                 _, ax, ay, az, ai, aj, ak, aw = _unpack(step.records)
@@ -573,7 +577,7 @@ class Chain:
         return common if self._edges else None
 
     def hold(self) -> Any:
-        """The samples of all edges as they are now, to be read at many stamps. Here None: numpy reads copies."""
+        """The present samples of all edges, for answers at many stamps. Here None: numpy reads copies."""
         return None
 
 
@@ -595,7 +599,7 @@ class Paths:
     inserted : int
         Number of samples at new stamps.
     version : int
-        Another number after each change.
+        A number that differs after each change.
     """
 
     __slots__ = ("_changes", "_kind", "_latest", "_lock", "inserted", "recent")
@@ -610,7 +614,7 @@ class Paths:
 
     @property
     def version(self) -> int:
-        """Not counted by itself, because every sample takes the time of that, and only a woken waiter reads it."""
+        """Computed when read: counting would cost every sample time, and only a woken waiter reads it."""
         return self.inserted + self._changes
 
     @version.setter
@@ -636,7 +640,7 @@ class Paths:
         return sample
 
     def commit(self, frames: Mapping[str, History], readers: Mapping[int, Any], batch: Sequence[Sample]) -> bool:
-        """Store a batch if all of it continues its histories and there are no readers to be told; else do nothing.
+        """Store a batch if all of it continues its histories and there are no readers to notify; else do nothing.
 
         Here only a batch of one sample is stored.
         """
@@ -648,6 +652,21 @@ class Paths:
                 return False
             self.inserted += 1
         return True
+
+
+def decode(
+    body: bytes,  # noqa: ARG001
+    at: int,
+    tags: tuple[tuple[str, bool], ...],  # noqa: ARG001
+    names: Mapping[bytes, tuple[str, str]],  # noqa: ARG001
+    kind: type[SampleT],  # noqa: ARG001
+) -> tuple[list[SampleT], int]:
+    """The samples of a little endian message from an offset on, up to the first that is not plain, and its offset.
+
+    A sample is plain if its names are known and its numbers need no correction. Here none is: `tfbus.tf_message`
+    decodes them all.
+    """
+    return [], at
 
 
 def commit(frames: Mapping[str, History], batch: Sequence[Sample], first: int) -> int:

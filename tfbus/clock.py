@@ -74,11 +74,11 @@ class Ticks:
 class Clock(Protocol):
     """The protocol of clocks: now, sleeping, ticks, timeouts and jumps.
 
-    A buffer sets one timer of the event loop for all its waiting lookups on a `SystemClock`, and on a `SimulatedClock`
-    uses its method ``call_after``. On any other clock, a class derived from these included, each wait has its
+    On a `SystemClock`, a buffer sets one timer of the event loop for all its waiting lookups; on a `SimulatedClock`, it
+    uses the method ``call_after``. On any other clock, also of a class derived from these two, each wait uses
     `move_on_after`.
 
-    A clock that has no time at first may have a property ``is_set``: until it is true, a bus compares no stamp with it.
+    A clock without a time at first may have a property ``is_set``. Until it is true, a bus compares no stamp with it.
     """
 
     def now(self) -> int:
@@ -148,9 +148,8 @@ class SimulatedClock:
     together, or woken by one publish or one `set`, run in the order of the event loop, which trio shuffles on purpose.
     A task that waits for a worker thread or a socket counts as blocked: simulated time is for one process.
 
-    A timer costs the same however many tasks there are. To see that all are blocked, `advance` counts, on an asyncio
-    loop, the calls of the method ``call_soon`` of the loop, and puts its counter in the place of that method until it
-    returns.
+    The cost of a timer does not depend on the number of tasks. On an asyncio loop, `advance` finds out that all tasks
+    are blocked by counting the calls of the loop's method ``call_soon``, which it replaces by its counter meanwhile.
 
     Parameters
     ----------
@@ -252,7 +251,7 @@ class SimulatedClock:
         """Call `callback` once, after a simulated duration in s, unless the registration is closed before.
 
         The timeouts of waiting lookups are such calls. `advance` makes the call between two runs of the tasks; it
-        raises what the call raises.
+        raises the errors of the call.
         """
         duration = as_duration(seconds, "seconds")
         if duration * SECOND >= STAMP_MAX:
@@ -276,8 +275,8 @@ class SimulatedClock:
         """Move the clock forward by a duration in s, and run the timed tasks that become due.
 
         All tasks run until they are blocked. Then the clock moves to the next due timer, fires it, and all tasks run
-        again, and so on. A task that never blocks keeps `advance` from returning. The stamps end with the greatest that
-        64 bits hold, where the clock stays; sleeps of a duration go on.
+        again, and so on. A task that never blocks keeps `advance` from returning. At the greatest stamp that 64 bits
+        hold, the clock stays; sleeps of a duration go on.
 
         Raises
         ------

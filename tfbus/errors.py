@@ -36,13 +36,13 @@ from tfbus.plain import from_fields, from_plain, printable, to_plain
 from tfbus.stamps import Latest, format_duration, format_stamp, likely_cause
 
 MOST_NAMES = 2_000
-"""The number of known names that an error about an unknown one keeps."""
+"""The number of known names that an error about an unknown name keeps."""
 
 LONGEST_NAME = 64
-"""The length of a name, in letters, beyond which it is similar to no other; the time of a comparison is quadratic."""
+"""Longer names, in letters, are never taken for similar, because the time of a comparison is quadratic."""
 
 LOOKED_AT = 10
-"""The number of known names that are compared in full with an unknown one; a comparison takes tens of microseconds."""
+"""The number of known names that are compared in full with an unknown name; each comparison takes tens of us."""
 
 SHOWN_FRAMES = 10
 """The number of frames of a loop that a text names."""
@@ -52,7 +52,7 @@ AnyError = TypeVar("AnyError", bound="TransformError")
 
 
 def loop_text(frames: Sequence[str]) -> str:
-    """The frames of a loop of parents in words, the first one repeated at the end; of a long loop, some."""
+    """The frames of a loop of parents in words, the first one repeated at the end; a long loop is shortened."""
     shown = frames
     if len(frames) > SHOWN_FRAMES:
         shown = (*frames[: SHOWN_FRAMES - 2], f"({len(frames) - SHOWN_FRAMES + 1} more)", frames[-1])
@@ -96,14 +96,14 @@ class TransformError(Exception):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """The error that `to_dict` made `data` of, of this class or of one below it.
+        """The error from which `to_dict` made `data`, of this class or a subclass.
 
         A cause that is not an error of tfbus comes back as an `Exception` with its type and message.
 
         Raises
         ------
         ValueError
-            If the data are not those of such an error. The message names the fact.
+            If the data do not describe such an error. The message names the fact.
         """
         given = dict(data)
         name, message, cause = (given.pop(key, None) for key in ("type", "message", "cause"))
@@ -123,8 +123,8 @@ class TransformError(Exception):
         return {name: hint for name, hint in get_type_hints(cls).items() if not name.startswith("_")}
 
     def _why(self) -> str:
-        """The message; a class that makes it of its facts has its own."""
-        # Not that of the next class, because `OSError` would make a message of its own.
+        """The message; a class that builds it from its facts overrides this."""
+        # Not `super().__str__()`, because `OSError` would make a message of its own.
         return Exception.__str__(self)
 
 
@@ -140,7 +140,7 @@ class TransformLookupError(TransformError, LookupError):
     Attributes
     ----------
     index : int or None
-        The index of the stamp without an answer in a lookup of many stamps; None for a lookup of one.
+        The index of the stamp without an answer in a lookup of many stamps; None for a lookup of one stamp.
     """
 
     index: int | None = None
@@ -158,8 +158,8 @@ class UnknownFrameError(TransformLookupError):
     frame : str
         The unknown frame.
     close_matches : tuple of str
-        Frames with a similar name, the most similar first: of the frames that were known when the error was raised, or
-        of some, if they were many. Computed when first read.
+        Frames with a similar name, the most similar first, among the frames that were known when the error was raised;
+        if these were many, only some of them are searched. Computed when first read.
     """
 
     frame: str
@@ -272,9 +272,8 @@ class ExtrapolationError(TransformLookupError):
     slack : int
         The greatest distance between the stamp and a sample that the policy allowed, in ns.
     ahead : int
-        The time from the clock's now to the edge's newest stamp, in ns, if that is more than the `max_ahead` of the
-        bus: then right samples are older than it, and may have expired. Otherwise 0, as in all errors of a tree without
-        a bus.
+        The time from the clock's now to the edge's newest stamp, in ns, if it exceeds the `max_ahead` of the bus: then
+        correct samples are older, and may have expired. Otherwise 0, as in all errors of a tree without a bus.
     """
 
     child: str
@@ -381,7 +380,7 @@ class GapError(ExtrapolationError):
 class AheadError(ExtrapolationError):
     """The newest answer is further ahead of the clock than `max_age` allows. Waiting for samples cannot help.
 
-    `stamp` is the newest stamp that was allowed, in ns; `child` is the edge that has come no further than the answer.
+    `stamp` is the newest stamp that was allowed, in ns; `child` is the edge that determines the stamp of the answer.
     """
 
     def _asked(self) -> str:
@@ -421,14 +420,14 @@ class LookupTimeoutError(TransformLookupError, TimeoutError):
         self._missing = missing
 
     def _why(self) -> str:
-        # Not earlier, because a thousand timeouts at once would look for the similar names of a thousand frames.
-        # One that comes back from JSON has only its cause.
+        # Not earlier, because a thousand timeouts at once would search similar names for a thousand frames.
+        # An error that comes back from JSON has only its cause.
         missing = self.__cause__ if self._missing is None else self._missing
         return f"no transform from {self.source!r} to {self.target!r} within {self.timeout:g} s: {missing}"
 
 
 class RemoteLookupError(TransformLookupError):
-    """The server of another process's buffer has given no answer, not even that the lookup has failed.
+    """The server of another process's buffer has given neither a transform nor the error of a failed lookup.
 
     Attributes
     ----------
@@ -438,9 +437,9 @@ class RemoteLookupError(TransformLookupError):
         The robot that was asked.
     reason : str
         ``"absent"``: there is no such server; ``"lost"``: it has gone, or cannot be reached any more; ``"busy"``: too
-        many lookups wait there, or come in a second; ``"silent"``: it is there, and does not answer;
-        ``"malformed"``: its answer, or the question, could not be read, or the answer is one to another question;
-        ``"internal"``: the lookup failed there with an error that is none of lookups.
+        many lookups wait there, or arrive per second; ``"silent"``: it is there, but does not answer; ``"malformed"``:
+        its answer, or the question, could not be read, or the answer belongs to another question; ``"internal"``: the
+        lookup failed there with an error that lookups do not raise.
     detail : str
         The same in words.
     """
@@ -471,7 +470,7 @@ class InvalidTransformError(TransformError, ValueError):
         The broken rule as a fixed text (``"cycle"``, ``"not finite"``, ``"frame name"``); statistics count rejected
         samples by it.
     parent, child, authority : str or None
-        Of the sample; None if not known where the error is raised.
+        Of the sample; None if the code that raises the error does not know it.
     loop : tuple of str
         For ``"cycle"``, the whole loop from child to parent, with its first frame repeated at the end.
     owner : str or None
@@ -513,7 +512,7 @@ class TooManyFramesError(InvalidTransformError):
     frames : int
         The number of frames on the bus.
     max_frames : int
-        The greatest number that it takes.
+        The greatest number of frames that it takes.
     """
 
     frames: int

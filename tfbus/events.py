@@ -116,8 +116,8 @@ class SampleRejected(PlainData):
 class PastLoop(PlainData):
     """Late samples form a loop of parents at a past stamp; the newest parents form none.
 
-    An event stream gives it once for each frame, parent and authority, as it does `SampleRejected`; the ``looped`` of
-    each buffer in ``statistics().buffers`` counts every sample.
+    An event stream gives it once for each frame, parent and authority, until the frame is removed or added or the clock
+    jumps back; the ``looped`` of each buffer in ``statistics().buffers`` counts every sample.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ class PastLoop(PlainData):
     frame, parent, authority : str
         Of the sample that closes the loop. It is stored.
     at : int
-        The first stamp of the loop from that of the sample on, in ns.
+        The first stamp at which the loop holds, not before the stamp of the sample, in ns.
     loop : tuple of str
         The frames of the loop from child to parent, the first one repeated at the end.
     """
@@ -199,8 +199,8 @@ class FrameLive(PlainData):
 class StampAhead(PlainData):
     """The newest sample of a frame is ahead of the clock by more than the `max_ahead` of the bus.
 
-    Until the clock has reached it, samples with right stamps are older than the newest one, and they expire once they
-    are older than the window. An event stream gives it once for each frame and authority, until the frame is removed or
+    Until the clock has reached its stamp, correct samples are older than this one, and they expire if they are older
+    than the window. An event stream gives the event once for each frame and authority, until the frame is removed or
     added or the clock jumps back. With ``reject_ahead=True`` the sample was refused, and nothing expires.
 
     Attributes
@@ -232,8 +232,8 @@ class StampBehind(PlainData):
     """A sample of a frame is behind the clock by more than the `max_behind` of the bus, or has expired in a buffer.
 
     An event stream gives it once for each frame and authority, until the frame is removed or added or the clock jumps
-    back. It does not tell of static samples, of recorded ones, and of the newest ones of before that a link brings when
-    it joins. No sample is behind a `SimulatedClock` that nobody has set.
+    back. There is no such event for static samples, for recorded samples, and for the older samples that a link brings
+    when it joins. No sample is behind a `SimulatedClock` that nobody has set.
 
     Attributes
     ----------
@@ -244,8 +244,8 @@ class StampBehind(PlainData):
     at : int
         The stamp of the sample, in ns.
     newest : int or None
-        The newest stamp of the frame, in ns, if the sample has expired because it is older than the window before that.
-        None if it is behind the clock.
+        If the sample has expired: the newest stamp of the frame, in ns, whose window does not reach back to the sample.
+        None if the sample is behind the clock.
     """
 
     stamp: int
@@ -264,7 +264,7 @@ class StampBehind(PlainData):
 
 
 def how_far_behind(at: int, now: int, newest: int | None) -> str:
-    """The distance of a stamp from the clock, or from the newest stamp by which it has expired, as text; all in ns."""
+    """The distance of a stamp from the clock, or, if it has expired, from the newest stamp, as text; all in ns."""
     if newest is None:
         return f"{format_duration(now - at)} behind the clock"
     return f"{format_duration(newest - at)} older than the newest, and has expired"
@@ -329,7 +329,7 @@ class PeerLost(PlainData):
     link, peer : str
         As in `PeerJoined`.
     authorities : tuple of str
-        The authorities of the buses that the peer led to, sorted.
+        The authorities of the buses that were reached by the peer, sorted.
     frames : tuple of str
         The frames whose newest sample came from the peer, sorted; a link that drops lost frames removes them.
     """
@@ -358,7 +358,7 @@ class PeerRejected(PlainData):
     reason : str
         The key in the `rejected` of the link's statistics.
     error : Exception
-        Why it was rejected.
+        The reason for the rejection.
     """
 
     stamp: int
@@ -368,7 +368,7 @@ class PeerRejected(PlainData):
     error: TransformError | Exception = field(compare=False)
 
     def __str__(self) -> str:
-        return _line(self.stamp, f"peer {self.peer} on {self.link} sent what was refused: {self.error}")
+        return _line(self.stamp, f"peer {self.peer} on {self.link} sent data that were refused: {self.error}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ class Prefix:
     Parameters
     ----------
     prefix : str
-        Put before each local name. A slash between the two must be part of the prefix, as in ``"robot1/"``.
+        The text before each local name. A slash between the two must be part of the prefix, as in ``"robot1/"``.
     shared : iterable of str
         Names that are the same for all robots, such as ``{"map"}``.
 
@@ -39,7 +39,7 @@ class Prefix:
         If the prefix, or a shared name, is empty or starts with a slash; or if a shared name starts with the prefix,
         because two local names would then be the same on the bus.
     TypeError
-        If they are not strings, or `shared` is a single one.
+        If they are not strings, or `shared` is a single string.
     """
 
     def __init__(self, prefix: str, shared: Iterable[str] = ()) -> None:

@@ -1,4 +1,4 @@
-"""Plain data, as JSON has them: the half of `to_dict` and `from_dict` that all classes share; and plain text.
+"""Plain data, as in JSON: the shared part of `to_dict` and `from_dict` of all classes; and plain text.
 
 Numbers, texts and None stay; a tuple becomes a list, a mapping a dict, and `LATEST` the text ``"LATEST"``. A number
 that is not finite becomes a text, because JSON has no such numbers: ``"NaN"``, ``"Infinity"`` or ``"-Infinity"``, as in
@@ -21,12 +21,11 @@ _PLAIN = frozenset((types.NoneType, bool, int, str))
 
 
 def printable(text: str) -> str:
-    """A text with the characters escaped that `repr` would escape, so that it stays in its line and its place.
+    """A text in which the characters that `repr` would escape are escaped, so that it stays in its line.
 
-    These are control and format characters, such as the ones that begin a new line, command a terminal, or reverse the
-    direction of letters; blanks other than the usual one; and code points that are no character. Letters of any
-    alphabet stay. A second call changes nothing, so a line may be made of names and of texts that are printable
-    already.
+    These are control and format characters, which begin a new line, command a terminal, or reverse the direction of
+    letters; blanks other than the usual one; and code points that are not characters. Letters of any alphabet stay. A
+    second call changes nothing, so a line may be made of names and of texts that are printable already.
     """
     if text.isprintable():
         return text
@@ -48,7 +47,7 @@ class PlainData:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """The object that `to_dict` made `data` of.
+        """The object from which `to_dict` made `data`.
 
         Raises
         ------
@@ -64,7 +63,7 @@ def to_plain(value: Any) -> Any:
     Raises
     ------
     TypeError
-        If there are none for its type.
+        If its type has none.
     """
     if value is None or isinstance(value, (bool, str)):
         return value
@@ -104,7 +103,7 @@ def from_fields(cls: type, data: Mapping[str, Any], kinds: Mapping[str, Any]) ->
     Raises
     ------
     ValueError
-        If they have not, or a field is of another kind. The message names it.
+        If a field is missing, unknown or of another kind. The message names it.
     """
     if not isinstance(data, Mapping):
         raise ValueError(f"a {cls.__name__} is a dict of its fields, not {data!r}")  # noqa: TRY004 - the data are wrong
@@ -117,7 +116,7 @@ def from_fields(cls: type, data: Mapping[str, Any], kinds: Mapping[str, Any]) ->
     found = {}
     for name, kind in kinds.items():
         value = given[name]
-        # Nearly all fields are plain, and a call and a name for each cost more than all the rest.
+        # Nearly all fields are plain, and a call and a name for each would cost more than everything else.
         found[name] = value if type(value) in _exact(kind) else from_plain(kind, value, f"{cls.__name__}.{name}")
     return found
 
@@ -166,7 +165,7 @@ def _readers_of(hint: Any) -> tuple[tuple[Any, Callable[[Any, Any, str], Any]], 
 
 
 def _origin_of(kind: Any) -> Any:
-    """The class behind a type; from Python 3.12 on, that of an array of numpy is behind an alias."""
+    """The class behind a type; from Python 3.12 on, an array of numpy is behind an alias."""
     origin = get_origin(kind) or kind
     alias = getattr(origin, "__value__", None)
     return origin if alias is None else _origin_of(alias)
@@ -225,7 +224,7 @@ def _read_array(_kind: Any, value: Any, name: str) -> Any:
         if dtype.kind not in "biuf":
             return _OTHER
         values = value["values"]
-        # numpy would cut the fractions off, and read numbers in any text.
+        # numpy would cut off fractions, and read numbers in any text.
         wanted = {"b": (bool,), "f": (int, float)}.get(dtype.kind, (int,))
         if not all(type(part) in wanted or (dtype.kind == "f" and part in _NOT_FINITE) for part in values):
             return _OTHER

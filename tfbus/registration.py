@@ -1,4 +1,4 @@
-"""The handle that a registering call returns, and a warning of what nobody has entered."""
+"""The handle that a registering call returns, and a warning about objects that nobody has entered."""
 
 import logging
 import os
@@ -38,7 +38,7 @@ class Registration:
 
 
 def warn_unless_entered(thing: object) -> "finalize[..., Any]":
-    """Have a line logged when something ends that nobody has entered; to enter it is to `detach` this."""
+    """Log a line when an object that nobody has entered is deleted; its ``async with`` calls `detach` of the result."""
     return finalize(thing, _warn_never_entered, type(thing).__name__, os.getpid())
 
 

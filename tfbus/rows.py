@@ -21,9 +21,9 @@ Numbers: TypeAlias = Sequence[float] | npt.NDArray[Any]
 Row: TypeAlias = tuple[float, float, float, float, float, float, float]
 
 NORM_TOLERANCE = 0.01
-"""The largest distance of a quaternion's norm from one that is accepted, and normalised."""
+"""The largest accepted distance of a quaternion's norm from one; such a quaternion is normalised."""
 ROUNDING = 1e-15
-"""The largest distance of a quaternion's squared norm from one that is left as it is."""
+"""The largest distance of a quaternion's squared norm from one at which the quaternion is left as it is."""
 IDENTITY: Row = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 Columns: TypeAlias = tuple[Any, Any, Any, Any, Any, Any, Any]

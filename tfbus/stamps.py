@@ -63,7 +63,7 @@ LATEST: Final = Latest.LATEST
 
 
 AtLike: TypeAlias = StampLike | Latest
-"""The types of an instant that is asked for: those that `as_stamp` accepts, and `LATEST`."""
+"""The types of an instant in a question: the types that `as_stamp` accepts, and `LATEST`."""
 
 
 def from_seconds(seconds: float, nanoseconds: SupportsIndex = 0) -> int:
@@ -74,7 +74,7 @@ def from_seconds(seconds: float, nanoseconds: SupportsIndex = 0) -> int:
     seconds : float
         An ``int`` is converted exactly, a ``float`` to the nanosecond nearest to its exact value.
     nanoseconds : int
-        Added to them, so that ``from_seconds(stamp.sec, stamp.nanosec)`` is exactly the stamp of a ROS message.
+        Added to the result, so that ``from_seconds(stamp.sec, stamp.nanosec)`` is exactly the stamp of a ROS message.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def as_at(value: AtLike) -> int | Latest: ...
 @overload
 def as_at(value: AtLike | None) -> int | Latest | None: ...
 def as_at(value: AtLike | None) -> int | Latest | None:
-    """As `as_stamp`, for an instant that is asked for: `LATEST` and None stay."""
+    """As `as_stamp`, for an instant in a question: `LATEST` and None stay."""
     return value if type(value) is int or value is None or isinstance(value, Latest) else as_stamp(value)
 
 
@@ -166,7 +166,7 @@ def as_stamps(values: StampsLike) -> Stamps:
     TypeError
         If a value has another type. The usual mistake is a float of seconds: convert it with `from_seconds`.
     ValueError
-        If the shape is not (n,), a value is masked, or one that `as_stamp` refuses.
+        If the shape is not (n,), a value is masked, or `as_stamp` refuses it.
     """
     if isinstance(values, (list, tuple)):
         if set(map(type, values)) == {int}:
@@ -192,7 +192,7 @@ def as_stamps(values: StampsLike) -> Stamps:
 
 
 def as_array(values: object, name: str, dtype: npt.DTypeLike | None = None) -> npt.NDArray[Any]:
-    """The array that `numpy.asarray` makes of values, which loses no mask.
+    """The array that `numpy.asarray` makes of values; masked values are refused, because it would drop their mask.
 
     Raises
     ------
@@ -212,12 +212,12 @@ def as_array(values: object, name: str, dtype: npt.DTypeLike | None = None) -> n
 
 
 def time_between(earlier: Stamps, later: Stamps) -> Stamps:
-    """The time from one stamp to another, elementwise, in ns; the longest that 64 bits hold where it is longer still.
+    """The time from one stamp to another, elementwise, in ns; a time beyond 64 bits becomes the longest within.
 
-    It is negative where `later` is the earlier one. The limit is 292 years.
+    It is negative where `later` is before `earlier`. The limit is 292 years.
     """
     time: Stamps = later - earlier
-    # The difference of two stamps has overflowed if its sign is not the one that their order demands.
+    # The difference of two stamps has overflowed if its sign contradicts their order.
     wrong = (time < 0) != (later < earlier)
     if wrong.any():
         time = np.where(wrong, np.where(later < earlier, -STAMP_MAX, STAMP_MAX), time)
@@ -274,9 +274,9 @@ def as_duration(seconds: float, name: str) -> float:
 
 
 def is_real(value: object) -> bool:
-    """Whether `value` is a real number of any type, those of numpy too; ``bool`` and ``timedelta64`` are none."""
+    """Whether `value` is a real number of any type, also of numpy; ``bool`` and ``timedelta64`` do not count."""
     kind = type(value)
-    # Nearly always one of these; the check of the abstract class takes ten times as long.
+    # The usual types first: the check of the abstract class takes ten times as long.
     return kind is float or kind is int or (isinstance(value, Real) and not isinstance(value, (bool, np.timedelta64)))
 
 
@@ -324,7 +324,7 @@ def likely_cause(stamp: int, other: int) -> str:
     """
     small, large = sorted((stamp, other), key=abs)
     is_far = abs(large - small) > _YEAR
-    # A stamp of simulated time may well be a thousandth of another one, unless it is so early.
+    # A stamp of simulated time may well be a thousandth of another stamp, unless it is so early.
     if small != 0 and (is_far or abs(small) < 1_000_000):
         for name, unit in (("seconds", SECOND), ("milliseconds", 1_000_000), ("microseconds", 1_000)):
             if abs(large - small * unit) <= min(_DAY, abs(large) // 10):

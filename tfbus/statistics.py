@@ -21,12 +21,12 @@ class BufferStatistics(PlainData):
     waiting : int
         Lookups that wait now.
     expired_ahead : int
-        The expired samples whose frame had a newest stamp ahead of the clock: see `StampAhead`.
+        The expired samples of frames whose newest stamp was ahead of the clock: see `StampAhead`.
     superseded : int
-        The expired samples that came late, and name another parent than a newer sample that was published
-        before the buffer joined.
+        The expired samples that were left out because a newer sample of their frame, published before the buffer
+        joined, names another parent.
     looped : int
-        Samples that formed a loop of parents at a past stamp, as late data can; they are among the samples above.
+        Samples that formed a loop of parents at a past stamp, as late data can; they are counted above as well.
     """
 
     offered: int
@@ -58,8 +58,8 @@ class QueueStatistics(PlainData):
     dropped : int
         Items that were discarded unread: the queue was full, the frame was removed, or the clock jumped back.
     conflated : int
-        Samples that gave way to another sample of the same child: moving ones of a queue with the overflow
-        ``"conflate"``, static ones of a full recorder.
+        Samples that another sample of the same child replaced: moving ones in a queue with the overflow
+        ``"conflate"``, static ones in a full recorder.
     """
 
     kind: str
@@ -79,14 +79,14 @@ class BusStatistics(PlainData):
     samples : int
         Accepted samples.
     rejected : mapping of str to int
-        Rejected samples, by reason. ``"displaced"`` are edges that had been accepted, and were removed to make room
-        for a frame that its sender has reserved.
+        Rejected samples, by reason. ``"displaced"`` counts edges that were accepted first, and removed later in favour
+        of a frame that its sender has reserved.
     reparented : int
         Samples that changed the newest parent of a child.
     kind_changes : int
         Samples that made a static child moving, or a moving child static.
     authority_conflicts : int
-        Samples whose authority differs from that of the sample before of the same child.
+        Samples whose authority differs from the authority of the previous sample of the same child.
     clock_resets : int
         Jumps back of the clock.
     callbacks_failed : int
@@ -124,9 +124,9 @@ class LinkStatistics(PlainData):
     peers : int
         Connected peers now.
     sent_messages, sent_samples : int
-        Messages and samples that were sent as they were published. Answers to peers that have missed something are not
-        counted again, and links of tfbus send nothing while nobody is there to hear it. Samples for peers that hear
-        only some frames are counted once for each set of frames.
+        Messages and samples that were sent when they were published. Samples that are sent again to peers that missed
+        them are not counted again. Links of tfbus send nothing while no peer listens. Samples for peers that hear only
+        some frames are counted once for each set of frames.
     received_messages, received_samples : int
         Messages and samples that were received and published on the bus.
     lost : int
@@ -162,12 +162,12 @@ class BufferServerStatistics(PlainData):
     waiting : int
         Lookups of other processes that wait now.
     answered, failed : int
-        Lookups that had a transform for an answer, and lookups that had an error.
+        Lookups that ended with a transform, and lookups that ended with an error.
     cancelled : int
         Lookups whose asker was cancelled, or has gone.
     refused : mapping of str to int
-        Questions that were refused, by reason: ``"busy"``, because too many wait or come; ``"malformed"``;
-        ``"internal"``, because of an error that is none of lookups, which is logged.
+        Questions that were refused, by reason: ``"busy"``, because too many wait or arrive; ``"malformed"``;
+        ``"internal"``, because of an error that lookups do not raise, which is logged.
     """
 
     waiting: int
@@ -189,12 +189,12 @@ class RecorderStatistics(PlainData):
     samples, messages : int
         Samples and messages that are in the file, and remain there if the process is killed.
     unattributed : int
-        The part of them whose authority is not in the file, because there were too many authorities.
+        Samples in the file without their authority, because there were too many authorities.
     refused : mapping of str to int
         Samples that a ROS message cannot hold, by reason.
     queue : QueueStatistics
         The samples that wait for the disk. Dropped samples were lost because the disk was too slow or failed; a
-        conflated sample is a static one that a newer one of the same child replaced in a full queue.
+        conflated sample is a static one that a newer sample of the same child replaced in a full queue.
     """
 
     samples: int

@@ -26,7 +26,7 @@ async def simulate(clock: SimulatedClock, function: Callable[[], Awaitable[T]], 
 
     Returns
     -------
-    The result of the function. An exception of the function is raised as it is, without an `ExceptionGroup`.
+    The result of the function. An exception of the function is raised unchanged, without an `ExceptionGroup`.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def assert_close(
     Parameters
     ----------
     actual, expected : Transform or TransformStamped
-        Of samples, only the transforms are compared.
+        For samples, only the transforms are compared.
     translation_tolerance : float
         Greatest distance in m.
     rotation_tolerance : float

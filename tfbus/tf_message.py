@@ -1,14 +1,14 @@
 """Transforms as the bytes of a ROS 2 ``tf2_msgs/msg/TFMessage``, and back.
 
-The message is ``geometry_msgs/msg/TransformStamped[] transforms``. The layout of one of them, with the offsets for two
-empty names::
+The message is ``geometry_msgs/msg/TransformStamped[] transforms``. The layout of one transform, with the offsets for
+two empty names::
 
     0  header.stamp       int32 sec, uint32 nanosec
     8  header.frame_id    string: uint32 length, UTF-8, NUL
    16  child_frame_id     string
    24  transform          float64 translation x, y, z, rotation x, y, z, w
 
-The encoding is plain CDR, version 1: a header of four bytes, of which the second is the byte order and the last two are
+The encoding is plain CDR, version 1: a header of four bytes, whose second is the byte order and whose last two are
 options (OMG DDSI-RTPS 2.5, section 10); then each number at a multiple of its own size, counted from the end of the
 header, and each string with a length that counts its NUL (OMG DDS-XTYPES 1.3, section 7.4.1). Because float64 comes
 last, every transform ends at a multiple of 8.
@@ -20,6 +20,7 @@ that it is refused with their errors.
 
 import math
 import struct
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice, repeat
 from typing import Any, Final, Generic, NamedTuple, TypeVar, cast, overload
@@ -30,6 +31,7 @@ from tfbus.geometry.transform import Transform
 from tfbus.plain import printable
 from tfbus.rows import NORM_TOLERANCE, ROUNDING, Row
 from tfbus.stamps import SECOND, format_stamp
+from tfbus.which_kernel import decode as decode_plain
 
 MAX_NAME: Final = 1_024
 """The length of the longest accepted frame name, in bytes of UTF-8."""
@@ -42,7 +44,7 @@ Tag = tuple[str, bool]
 
 
 class MalformedMessageError(ValueError):
-    """A payload that is no valid message of transforms; none of its transforms was accepted.
+    """A payload that is not a valid message of transforms; none of its transforms was accepted.
 
     Attributes
     ----------
@@ -109,7 +111,7 @@ def encode(samples: Sequence[TransformStamped]) -> bytes:
     Raises
     ------
     InvalidTransformError
-        The `refusal` of the first sample that a message cannot hold.
+        If a message cannot hold a sample; it is the `refusal` of the first such sample.
     """
     pack_stamp, pack_numbers, piece_of = _STAMP.pack, _LITTLE_ENDIAN.numbers.pack, _pieces.get
     parts = [_HEADER, _LITTLE_ENDIAN.size.pack(len(samples))]
@@ -143,7 +145,7 @@ def _piece(parent: str, child: str, first: bool) -> bytes:
 
 
 def refusal(sample: TransformStamped) -> InvalidTransformError | None:
-    """The error for a sample that a message cannot hold; None for others.
+    """The error for a sample that a message cannot hold; None if it can.
 
     The reason is ``"stamp"`` before December 1901 and after January 2038, because ROS has 32 bits for the seconds, and
     ``"frame name"`` for a name that is longer than `MAX_NAME` or has no UTF-8, such as half of a surrogate pair.
@@ -198,8 +200,8 @@ def decode(
     Raises
     ------
     MalformedMessageError
-        If the payload is no such message, or there is not one tag for each transform. No payload raises another error,
-        and the memory used is proportional to the size of the payload, whatever counts and lengths it contains.
+        If the payload is not such a message, or there is not one tag for each transform. No payload raises another
+        error. The memory used is proportional to the size of the payload, even if its counts and lengths are false.
 
     Notes
     -----
@@ -215,12 +217,12 @@ def decode(
 def decode_in_parts(
     payload: bytes, most: int, kind: type[SampleT], bare_names: bool = False, tags: Iterable[Tag] | None = None
 ) -> Iterator[Decoded[SampleT]]:
-    """Decode the samples of a message, at most so many at a time; the parameters are those of `decode`.
+    """Decode the samples of a message, a limited number at a time; the other parameters are as in `decode`.
 
     Raises
     ------
     MalformedMessageError
-        Once the samples that are sound up to there are decoded.
+        After the valid samples before the fault.
     """
     body, layout, count = _open(payload)
     end, rest = _FIRST, iter(_as_tags(tags, count))
@@ -277,7 +279,10 @@ def _transforms_of(
     names_of, make = cache.get, cast(Any, kind.__new__)
     samples: list[Any] = []
     errors: list[InvalidTransformError] = []
-    for tag in tags:
+    rest = tuple(tags)
+    if layout is _LITTLE_ENDIAN and sys.byteorder == "little":
+        samples, at = decode_plain(body, at, rest, cache, kind)
+    for tag in rest[len(samples) :]:
         seconds, nanoseconds, length = head(body, at)
         middle = at + 12 + length + 3 & -4
         (length,) = size(body, middle)

@@ -1,10 +1,10 @@
 """The choice between the compiled kernel and its twin in Python. Other modules import every twin from here.
 
-The environment variable ``TFBUS_KERNEL`` asks for ``python`` or ``compiled``. Without it, the compiled one runs where
+The environment variable ``TFBUS_KERNEL`` asks for ``python`` or ``compiled``. Without it, the compiled kernel runs if
 it was built and can be loaded.
 
-`tfbus._python_kernel` is the definition: ``_kernel.c`` does the same, with the same bits. Shortcuts of publishing exist
-in C only, because in Python they would be no shorter than the ordinary way: `Intake` takes a plain batch, and the
+`tfbus._python_kernel` is the definition: ``_kernel.c`` does the same, with the same bits. The fast path of publishing
+exists in C only, because in Python it would not be faster than the ordinary path: `Intake` takes a plain batch, and the
 `Feed` of each buffer stores it and wakes the lookups that waited for it.
 """
 
@@ -58,6 +58,7 @@ if kernel == "python":
         Sample,
         commit,
         compose_paths,
+        decode,
     )
 
     Feed: Any = None
@@ -76,6 +77,7 @@ else:
         Sample,
         commit,
         compose_paths,
+        decode,
     )
 
 __all__ = [
@@ -91,6 +93,7 @@ __all__ = [
     "Sample",
     "commit",
     "compose_paths",
+    "decode",
     "kernel",
     "plain_first",
 ]
@@ -99,13 +102,13 @@ __all__ = [
 def plain_first(method: MethodT, many: type | None = None) -> MethodT:
     """A method that runs only if ``self._paths`` has no plain answer; that answer must be the method's own.
 
-    This is the only place where a question of the synchronous methods is tried for the plain answer. The frame of a
-    method with many keyword arguments takes as long as the answer itself, so the compiled kernel stands before it.
+    This is the only place that tries the plain answer for the synchronous methods. Calling a Python method with many
+    keyword arguments takes as long as the answer itself, so the compiled kernel answers before the call.
 
     Parameters
     ----------
     method : function
-        ``(self, target, source, at=LATEST, ...)``. Where ``self._paths`` is None, it always runs.
+        ``(self, target, source, at=LATEST, ...)``. If ``self._paths`` is None, it always runs.
     many : type, optional
         The array type of the answers, if `method` takes stamps instead of `at`. Only the compiled kernel has plain
         answers at many stamps.

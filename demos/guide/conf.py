@@ -58,7 +58,7 @@ nitpick_ignore_regex = [
     ("py:class", r"tfbus\..*\.MalformedMessageError"),
     # The parts of a recording for code that reads it in blocks.
     ("py:class", r"tfbus\.recording\.(recording\.(Decoded)?Block|formats\.\w+\.RawTransform)"),
-    # The parts of a link, and a follower of the time that is no clock.
+    # The parts of a link, and the follower of a clock.
     ("py:class", r"tfbus\.links\.(clock_follower\.HearsTime|endpoint\.Endpoint|wire\.Wire|lookups\.Serving)"),
     ("py:class", r"tfbus\.links\.(link\.DomainOptions|ros\.\w+\.(RosCarrier|RosOptions))"),
     # Sphinx splits the parameters of such types.
@@ -78,7 +78,7 @@ myst_heading_anchors = 3
 
 autodoc_default_options = {
     "members": True,
-    # What Python's own classes have is not told again.
+    # Members of Python's own classes are not documented again.
     "inherited-members": "BaseException, Enum, tuple, object",
     # The parts of a link call these.
     "exclude-members": "receive, send_soon, stir, serve, lookups",
@@ -90,7 +90,7 @@ python_use_unqualified_type_names = True
 numpydoc_show_class_members = False
 default_role = "py:obj"
 
-# The import paths of which the reference tells, the preferred one first. Modules may move below them.
+# The import paths in the reference, the preferred one first. Modules may move below them.
 PATHS = (
     "tfbus",
     "tfbus.links",
@@ -154,10 +154,10 @@ WORDS = frozenset(words())
 
 
 def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: TextElement) -> Element | None:
-    """The targets that the reference has under another name, or not at all.
+    """The target of a name that the reference has under another name, or not at all.
 
     Annotations have names from inner modules, such as ``tfbus.stamps.Latest``: they are found by identity. Docstrings
-    of one import path name what is in another, such as `SimulatedClock` in ``tfbus.testing``. Arguments and attributes
+    of one import path use names of another, such as `SimulatedClock` in ``tfbus.testing``. Arguments and attributes
     are code and link to nothing.
     """
     if node.get("refdomain") != "py":

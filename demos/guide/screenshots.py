@@ -40,7 +40,7 @@ def control(page: Page, name: str) -> Any:
 
 
 def photograph(address: str, name: str, prepare: Callable[[Page], None]) -> None:
-    """Open a page, prepare it, and write what it looks like."""
+    """Open a page, prepare it, and write a picture of it."""
     with sync_playwright() as player:
         browser = player.chromium.launch(
             executable_path=shutil.which("chromium"),

@@ -267,7 +267,7 @@ async def gives_way(budget: TurnBudget) -> bool:
 
 async def test_work_gives_way_once_its_time_is_spent_and_not_before() -> None:
     now = 0.0
-    budget = TurnBudget(2.0, lambda: now)
+    budget = TurnBudget(2.0, lambda: now, lambda: now)
     now = 1.5
     assert not budget.spent
     assert not await gives_way(budget)
@@ -281,6 +281,20 @@ async def test_work_gives_way_once_its_time_is_spent_and_not_before() -> None:
     now = 5.0
     assert not budget.spent
     now = 5.5
+    assert budget.spent
+
+
+def test_the_time_in_which_a_thread_waits_for_a_processor_does_not_count() -> None:
+    now = busy = 0.0
+    budget = TurnBudget(2.0, lambda: now, lambda: busy)
+    now, busy = 50.0, 1.5
+    assert not budget.spent
+    now = 50.4
+    assert not budget.spent
+    now, busy = 50.5, 1.9
+    assert not budget.spent
+    busy = 2.0
+    now = 50.7
     assert budget.spent
 
 

@@ -1,57 +1,75 @@
-"""Many processes with a link each that start at once: how long until every bus has every static frame.
+"""Many processes with a link each that start at once: how long until every bus has every static frame, and what then.
 
 Each has some static frames, and as many moving ones, which it publishes all the while.
 """
 
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from statistics import median
 from threading import Timer
-from typing import Any
-from uuid import uuid4
+from typing import Any, NamedTuple
 
 import anyio
+from support.peer_process import link_of
+from support.processes import Place
 
-from tfbus import Bus, Transform, TransformBroadcaster, TransformStamped
-from tfbus.links.zenoh import ZenohLink
+from tfbus import SECOND, Bus, Transform, TransformBroadcaster, TransformStamped
 
 PATIENCE = 120.0
 """Seconds from the last start; a process that has not all frames by then counts as one without them."""
 FRAMES, RATE = 20, 20.0
 
 
-async def live(number: int, processes: int, domain: str, address: str) -> None:
-    """Be one of the processes; print the time at which all static frames were there."""
+class Facts(NamedTuple):
+    """What one process found."""
+
+    met: float
+    """Seconds from the last start until it had all static frames; infinite if it never had."""
+    delay: float
+    """The median of the seconds from the stamp of a sample until it was here, once all were there."""
+
+
+async def live(number: int, processes: int, link: dict[str, Any], seconds: float) -> None:
+    """Be one of the processes; print when all static frames were there, and the delay of samples `seconds` after it."""
     wanted = processes * FRAMES
     held: set[str] = set()
-    side: dict[str, Any] = {"connect" if number else "listen": address}
+    delays: list[float] = []
+    met = math.inf
 
     def note(batch: tuple[TransformStamped, ...]) -> None:
-        before = len(held)
-        held.update(sample.child for sample in batch if sample.static)
-        if before < len(held) == wanted:
-            print(time.monotonic(), flush=True)
+        nonlocal met
+        now = time.time_ns()
+        if not batch[0].static:
+            if met + seconds / 2 < time.monotonic() and batch[0].authority != f"p{number}":
+                delays.append((now - batch[0].stamp) / SECOND)
+            return
+        held.update(sample.child for sample in batch)
+        if len(held) == wanted:
+            met = min(met, time.monotonic())
 
     with Bus() as bus:
         bus.subscribe(note)
         broadcaster = TransformBroadcaster(bus, authority=f"p{number}")
         for frame in range(FRAMES):
             broadcaster.send_static("map", f"static {number} {frame}", Transform())
-        async with ZenohLink(bus, domain, **side):
+        async with link_of(bus, link):
+            await bus.clock.sleep(number / processes / RATE)
+            told = False
             async for _ in bus.clock.ticks(RATE):
                 broadcaster.send_all([("map", f"moving {number} {frame}", Transform()) for frame in range(FRAMES)])
+                if not told and met + seconds < time.monotonic():
+                    told = True
+                    print(json.dumps([met, median(delays or [math.inf])]), flush=True)
 
 
-def measure(processes: int) -> list[float]:
-    """Seconds from the last start until each process has all static frames; infinite for one that has not."""
-    # The other processes do not find it.
-    from support.processes import free_address
-
-    task = {"processes": processes, "domain": f"start-{uuid4().hex}", "address": free_address()}
+def measure(processes: int, place: Place, seconds: float = 0.0) -> list[Facts]:
+    """Start them; measure the delay for some `seconds` after a process has met all."""
     started: list[subprocess.Popen[str]] = []
 
     def end_all() -> None:
@@ -60,12 +78,16 @@ def measure(processes: int) -> list[float]:
 
     with tempfile.TemporaryDirectory() as folder:
         # As of a package that is installed: else each process compiles all modules where no bytecode may be written.
-        compiled = os.environ | {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": folder}
-        imports = [sys.executable, "-c", "import start_together"]
+        paths = os.pathsep.join(sys.path)
+        compiled = os.environ | {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": folder, "PYTHONPATH": paths}
+        modules = ["start_together", *["tfbus.links.zenoh"] * (place.carrier == "router")]
+        imports = [sys.executable, "-c", f"import {', '.join(modules)}"]
         subprocess.run(imports, env=compiled, cwd=Path(__file__).parent, check=True)
         try:
             for number in range(processes):
-                command = [sys.executable, __file__, json.dumps(task | {"number": number})]
+                task = {"number": number, "processes": processes, "seconds": seconds}
+                task["link"] = place.other() if number else place.first()
+                command = [sys.executable, __file__, json.dumps(task)]
                 started.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=compiled))
             last = time.monotonic()
             patience = Timer(PATIENCE, end_all)
@@ -76,7 +98,8 @@ def measure(processes: int) -> list[float]:
             end_all()
             for process in started:
                 process.communicate()
-    return [float(end or "inf") - last for end in ends]
+    found = [json.loads(end) if end else (math.inf, math.inf) for end in ends]
+    return [Facts(met - last, delay) for met, delay in found]
 
 
 if __name__ == "__main__":

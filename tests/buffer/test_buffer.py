@@ -153,33 +153,6 @@ async def test_a_timeout_expires_on_the_clock_of_the_bus(timeout: float) -> None
         assert asked.answer == round(timeout * SECOND)
 
 
-async def test_a_lookup_that_waits_again_keeps_its_deadline() -> None:
-    clock, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "c", 9 * SECOND, timeout=8.0))
-        for second, (parent, child) in enumerate([("map", "a"), ("a", "b"), ("b", "c")]):
-            await clock.advance(2.0)
-            bus.publish(driving(parent, child, second))
-            await settle()
-            assert len(buffer.pending()) == 1
-        await clock.advance(1.999)
-        assert not asked.ended
-        await clock.advance(0.001)
-        assert isinstance(asked.error, LookupTimeoutError)
-
-
-async def test_jumps_of_the_clock_do_not_change_a_timeout() -> None:
-    clock, _, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", timeout=3.0))
-        await clock.advance(1.0)
-        clock.set(1000 * SECOND)
-        await clock.advance(1.999)
-        assert not asked.ended
-        await clock.advance(0.001)
-        assert isinstance(asked.error, LookupTimeoutError)
-
-
 @pytest.mark.parametrize("phase", ["before the report", "after the report", "at the timeout"])
 @pytest.mark.parametrize("data_first", [True, False])
 @pytest.mark.parametrize("timeout", [None, 2.0, 7.0])
@@ -216,29 +189,6 @@ async def test_fail_after_around_a_lookup_leaves_no_waiter() -> None:
     assert buffer.pending() == ()
 
 
-@pytest.mark.parametrize("change", ["replace", "remove", "reset"])
-async def test_the_answer_that_woke_a_lookup_is_dropped_if_the_tree_changes_in_the_same_turn(change: str) -> None:
-    clock, bus, buffer = make()
-    bus.publish(moving("map", "a", 0))
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
-        await settle()
-        bus.publish(moving("map", "a", 5, 1.0))
-        if change == "replace":
-            bus.publish(moving("map", "a", 5, 2.0))
-        elif change == "remove":
-            bus.remove_frame("a")
-            await settle()
-            assert not asked.ended
-            bus.publish(moving("map", "a", 5, 2.0))
-        else:
-            clock.set(clock.now() - 1)
-    if change == "reset":
-        assert isinstance(asked.error, ClockResetError)
-    else:
-        assert asked.answer.transform.translation == (2.0, 0.0, 0.0)
-
-
 # LATEST and max_age
 
 
@@ -256,38 +206,7 @@ async def test_max_age_refuses_the_last_sample_of_a_dead_broadcaster() -> None:
     assert (caught.value.child, caught.value.stamp, caught.value.newest) == ("a", 1_000_000, 0)
 
 
-async def test_a_lookup_with_max_age_waits_for_a_sample_that_is_recent_enough() -> None:
-    clock, bus, buffer = make()
-    bus.publish([driving("map", "a", 0), static("a", "b")])
-    async with anyio.create_task_group() as tasks:
-        await clock.advance(5.0)
-        asked = Asked(tasks, partial(buffer.lookup, "map", "b", max_age=0.5))
-        await clock.advance(3.0)
-        bus.publish(driving("map", "a", 7.0))
-        await settle()
-        assert not asked.ended
-        bus.publish(driving("map", "a", 7.5))
-        await settle()
-        assert asked.answer.stamp == 7_500_000_000
-
-
 # Waking
-
-
-@pytest.mark.parametrize("data_first", [True, False])
-async def test_a_lookup_cancelled_and_woken_in_one_turn_leaves_no_waiter(data_first: bool) -> None:
-    _, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
-        other = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
-        await settle()
-        steps: list[Callable[[], object]] = [asked.cancel, lambda: bus.publish(moving("map", "a", 5))]
-        for step in reversed(steps) if data_first else steps:
-            step()
-        await settle()
-        assert asked.ended
-        assert other.answer.stamp == 5
-    assert buffer.pending() == ()
 
 
 # Pending lookups and the log

@@ -7,10 +7,9 @@ from itertools import product
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
-from support.samples import any_samples, edges_of, moving, over, static, tree_of, x_of
+from support.samples import any_samples, moving, over, static, tree_of, x_of
 
 from tfbus import (
     LATEST,
@@ -298,98 +297,3 @@ def test_samples_of_a_prefill_stay_when_the_bus_reparents_later_than_them(heard:
 
 
 # Any history
-
-samples = any_samples(FRAMES, 12)
-trees = st.lists(samples, max_size=6)
-
-
-def newest_of(bus: Bus) -> dict[str, tuple[str, bool]]:
-    return {edge.frame: (edge.parent, edge.static) for edge in edges_of(bus)}
-
-
-class LateBuffers(RuleBasedStateMachine):
-    """Buffers that join a bus at any moment, with any window and any prefill."""
-
-    buffers = Bundle("buffers")
-
-    @initialize(target=buffers)
-    def begin(self) -> Buffer:
-        self.clock = SimulatedClock(1_000)
-        self.bus = Bus(self.clock)
-        self.open: list[Buffer] = []
-        return self.join(None, None)
-
-    def join(self, keep: int | None, prefill: Buffer | TransformTree | None) -> Buffer:
-        buffer = Buffer(self.bus, None if keep is None else keep * NANO, prefill=prefill)
-        self.open.append(buffer)
-        return buffer
-
-    @rule(target=buffers, keep=st.none() | st.integers(0, 12))
-    def join_empty(self, keep: int | None) -> Buffer:
-        return self.join(keep, None)
-
-    @rule(target=buffers, keep=st.none() | st.integers(0, 12), other=buffers)
-    def join_prefilled(self, keep: int | None, other: Buffer) -> Buffer:
-        return self.join(keep, other)
-
-    @rule(target=buffers, stored=trees)
-    def join_with_a_foreign_tree(self, stored: list[TransformStamped]) -> Buffer:
-        tree = TransformTree(keep=None)
-        for sample in stored:
-            with suppress(InvalidTransformError):
-                tree.insert(sample)
-        return self.join(None, tree)
-
-    @rule(target=buffers, buffer=consumes(buffers))
-    def leave(self, buffer: Buffer) -> object:
-        buffer.close()
-        if buffer in self.open:
-            self.open.remove(buffer)
-        # It may still be the prefill of others.
-        return multiple(buffer)
-
-    @rule(batch=st.lists(samples, min_size=1, max_size=3))
-    def publish(self, batch: list[TransformStamped]) -> None:
-        self.bus.publish(batch, invalid="drop")
-
-    @rule(frame=st.sampled_from(FRAMES))
-    def remove(self, frame: str) -> None:
-        with suppress(UnknownFrameError):
-            self.bus.remove_frame(frame)
-
-    @rule()
-    def jump_back(self) -> None:
-        self.clock.set(self.clock.now() - 1)
-
-    @invariant()
-    def the_newest_edges_of_each_buffer_are_those_of_the_bus(self) -> None:
-        newest = newest_of(self.bus)
-        for buffer in self.open:
-            for edge in buffer.tree.edges():
-                if edge.samples and edge.child in newest:
-                    assert (edge.parent, edge.static) == newest[edge.child]
-
-    @invariant()
-    def no_buffer_holds_a_loop_even_with_what_it_has_not_seen(self) -> None:
-        parents = {child: parent for child, (parent, _) in newest_of(self.bus).items()}
-        for buffer in self.open:
-            own = {edge.child: edge.parent for edge in buffer.tree.edges() if edge.samples}
-            check_no_loop({**own, **parents})
-
-    @invariant()
-    def every_sample_is_counted(self) -> None:
-        for counted in self.bus.statistics().buffers:
-            assert counted.offered == counted.inserted + counted.replaced + counted.expired
-            assert counted.superseded <= counted.expired
-
-
-def check_no_loop(parents: dict[str, str]) -> None:
-    for frame in parents:
-        walk = [frame]
-        while walk[-1] in parents:
-            walk.append(parents[walk[-1]])
-            assert len(walk) <= len(parents) + 1, walk
-
-
-TestLateBuffers = LateBuffers.TestCase
-TestLateBuffers.settings = settings(stateful_step_count=25)

@@ -104,22 +104,6 @@ async def test_a_watch_starts_with_the_current_answer_and_then_gives_each_new_on
     assert changes.skipped == 0
 
 
-async def test_without_thresholds_a_new_stamp_or_a_new_value_is_a_change() -> None:
-    _, bus, buffer = make()
-    samples = [
-        moving("map", "a", 1, 5.0),
-        moving("map", "a", 2, 5.0),
-        moving("map", "a", 2, 6.0),
-        moving("map", "a", 2, 6.0),
-        moving("map", "a", 1, 9.0),
-        moving("map", "a", 3, 6.0),
-    ]
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "a") as changes:
-            got = await read_along(changes, bus, samples, tasks)
-    assert [(answer.stamp, x_of(answer)) for answer in got] == [(1, 5.0), (2, 5.0), (2, 6.0), (3, 6.0)]
-
-
 @pytest.mark.parametrize(
     ("before", "after", "angle"),
     [
@@ -171,16 +155,6 @@ async def test_max_rate_gives_the_newest_answer_once_a_period(hz: float) -> None
         assert time - 0.01 - 1e-9 <= x <= time + 1e-9
     # All updates in between are counted as skipped.
     assert skipped == sum(round(after * 100) - round(before * 100) - 1 for before, after in pairwise(xs))
-
-
-async def test_a_reader_slower_than_the_period_gets_the_next_answer_at_once() -> None:
-    clock, bus, buffer = make()
-    bus.publish(moving("map", "a", 1))
-    with buffer.watch("map", "a", max_rate=1.0) as changes:
-        await anext(changes)
-        bus.publish(moving("map", "a", 2))
-        await clock.advance(1.0)
-        assert (await anext(changes)).stamp == 2
 
 
 @pytest.mark.parametrize("resting", [True, False])
@@ -369,32 +343,6 @@ async def test_a_jump_back_gives_a_static_answer_again_and_a_jump_forward_does_n
 
 
 # Cancellation, readers and threads
-
-
-@pytest.mark.parametrize("doing", ["waiting", "resting", "without an answer", "beginning"])
-async def test_a_cancelled_reader_loses_no_answer_and_leaves_no_waiter(doing: str) -> None:
-    clock, bus, buffer = make()
-    if doing != "without an answer":
-        bus.publish(moving("map", "a", 1))
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "a", max_rate=1.0) as changes:
-            if doing in ("waiting", "resting"):
-                await anext(changes)
-            if doing == "resting":
-                bus.publish(moving("map", "a", 2))
-            asked = Asked(tasks, changes.__anext__)
-            if doing != "beginning":
-                await settle()
-            asked.cancel()
-            await settle()
-            assert asked.cancelled
-            assert buffer.pending() == ()
-            if doing in ("waiting", "without an answer"):
-                bus.publish(moving("map", "a", 2))
-            again = Asked(tasks, changes.__anext__)
-            await clock.advance(1.0)
-            assert again.answer.stamp == (1 if doing == "beginning" else 2)
-    assert buffer.pending() == ()
 
 
 async def test_a_second_reader_is_busy_and_the_first_continues() -> None:

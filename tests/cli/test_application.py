@@ -34,11 +34,10 @@ def instead(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., object]]
     return lambda other: monkeypatch.setattr(LinkOptions, "run", other)
 
 
-NEED = "--connect and --listen need a package more:"
+NEED = "--connect and --listen need one more package:"
 DEFAULTS = {
     "check": "10.0 100000000.0 100.0 100.0 tf",
     "demo": "inf 100.0 1.0",
-    "router": "tcp/127.0.0.1:17447",
     "view": "8080 127.0.0.1 30.0 tf",
 }
 
@@ -235,18 +234,23 @@ def test_letters_that_the_output_cannot_encode_are_escaped(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("package", "arguments", "status", "message"),
     [
-        ("cyclopts", "tree", 1, f"the command needs some packages more: {pip_install('cli')}"),
-        ("zenoh", "router", 2, f"a router needs a package more: {pip_install('cli,zenoh')}"),
+        ("cyclopts", "tree", 1, f"the command needs more packages: {pip_install('cli')}"),
+        ("zenoh", "router", 2, f"a router needs one more package: {pip_install('cli,zenoh')}"),
         *(
             ("zenoh", f"{words} tcp/127.0.0.1:1", 2, f"{NEED} {pip_install('cli,zenoh')}")
             for words in ("listen --connect", "tree --listen", "bridge tf dds --connect")
         ),
-        ("mcap.writer", "record run.mcap --domain DOMAIN", 2, f"to record needs a package more: {pip_install('bag')}"),
+        (
+            "mcap.writer",
+            "record run.mcap --domain DOMAIN",
+            2,
+            f"recording needs one more package: {pip_install('bag')}",
+        ),
         (
             "urdf_parser_py",
             f"robot {URDF} --tree",
             2,
-            f"to read URDF, tfbus needs a package more: {pip_install('urdf')}",
+            f"to read URDF, tfbus needs one more package: {pip_install('urdf')}",
         ),
     ],
 )

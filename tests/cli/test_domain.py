@@ -115,7 +115,7 @@ def test_an_address_in_use_is_a_usage_error(backend: str, tfbus: Command) -> Non
 def test_without_its_extra_joining_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tfbus.links.zenoh", None)
     for options in (LinkOptions(connect=(NOBODY,)), LinkOptions(listen=(NOBODY,))):
-        with pytest.raises(UsageError, match=re.escape('need a package more: pip install "tfbus[cli,zenoh]"')):
+        with pytest.raises(UsageError, match=re.escape('need one more package: pip install "tfbus[cli,zenoh]"')):
             join(options)
 
 
@@ -148,7 +148,7 @@ def test_it_is_said_whom_a_program_hears_and_how(
                 if "1 peer" in said:
                     other.publish(static("map", "odom"))
                     await met.wait()
-                options.say_who_is_heard(links)
+                options.print_peers(links)
 
     anyio.run(meet)
     assert capsys.readouterr() == ("", f"{said}\n")

@@ -296,7 +296,7 @@ def test_the_error_of_what_is_no_message_names_its_fields() -> None:
         with pytest.raises(TypeError) as caught:
             from_message(message)
         assert str(caught.value) == (
-            f"a {kind} is no message that can be transformed; its fields are a, b, c, d, e, f, g, h, i, j"
+            f"a {kind} is not a message that can be transformed; its fields are a, b, c, d, e, f, g, h, i, j"
         )
 
 

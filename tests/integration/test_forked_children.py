@@ -11,7 +11,7 @@ import asyncio, multiprocessing, os, sys, tempfile
 import anyio
 from tfbus import Buffer, Bus, LocalLink, TransformBroadcaster, Transform, TransformStamped
 from tfbus.links import BufferServer
-from tfbus.links.zenoh import ZenohLink
+from tfbus.links.zenoh import ZenohLink, ZenohRouter
 from tfbus.recording import Recorder
 
 def sample(stamp):
@@ -203,11 +203,11 @@ entered = ZenohLink(Bus(), listen="tcp/127.0.0.1:0")
 anyio.run(enter, entered)
 tell(anyio.run, enter, ZenohLink(Bus(), listen="tcp/192.0.2.1:1"))
 tell(ZenohLink, Bus(), "no domain")
-# One link goes at once, the program keeps four to its end; the copies in a child are not told of again.
+# One link goes at once, the program keeps five to its end; the copies in a child are not told of again.
 RmwZenohLink(Bus())
 link = LocalLink(Bus())
 kept = [ZenohLink(Bus(), connect="tcp/127.0.0.1:1"), RosbridgeLink(Bus(), "ws://127.0.0.1:9090"), link]
-kept.append(BufferServer(Buffer(link.bus), link))
+kept += [BufferServer(Buffer(link.bus), link), ZenohRouter("tcp/127.0.0.1:1")]
 in_a_child(lambda: sys.exit())
 """
     command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", program]
@@ -215,5 +215,5 @@ in_a_child(lambda: sys.exit())
     assert [line.split()[0] for line in done.stdout.splitlines()] == ["OSError", "ValueError"]
     assert sorted(done.stderr.splitlines()) == [
         f"a {name} was made and never entered, so it has done nothing: write `async with {name}(...)`"
-        for name in ("BufferServer", "LocalLink", "RmwZenohLink", "RosbridgeLink", "ZenohLink")
+        for name in ("BufferServer", "LocalLink", "RmwZenohLink", "RosbridgeLink", "ZenohLink", "ZenohRouter")
     ]

@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import socket
 import sys
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager, suppress
@@ -23,6 +24,7 @@ from support.processes import free_address, free_ports, new_domain, until
 from support.rosbridge import rosbridge_server
 
 from tfbus import Buffer, Bus, LocalLink, RemoteLookupError, Transform, TransformBroadcaster
+from tfbus.cli.arguments import UsageError
 from tfbus.cli.commands.router import router
 from tfbus.links import BufferServer
 from tfbus.links.dds import DdsLink
@@ -31,8 +33,8 @@ from tfbus.links.local.local_wire import LocalWire
 from tfbus.links.message import Kind, write_body
 from tfbus.links.rmw_zenoh import RmwZenohLink
 from tfbus.links.rosbridge import RosbridgeLink
-from tfbus.links.zenoh import ZenohLink, ZenohRouter
-from tfbus.links.zenoh.addresses import client_config, open_session
+from tfbus.links.zenoh import ZenohLink, ZenohRouter, zenoh_router
+from tfbus.links.zenoh.sessions import client_config, open_session
 from tfbus.view import View
 
 ROOT = Path(__file__).parents[2]
@@ -209,10 +211,15 @@ async def test_dds_has_ports_open_at_all_addresses_although_it_looks_for_this_ma
     assert not all(map(is_of_this_machine, opened))
 
 
-def test_a_router_listens_at_the_loopback_unless_it_is_told_otherwise() -> None:
-    for made in (ZenohRouter, router):
-        listen = inspect.signature(made).parameters["listen"].default
-        assert re.fullmatch(r"tcp/127\.0\.0\.1:\d+", listen if isinstance(listen, str) else "".join(listen))
+def test_a_router_listens_at_the_loopback_unless_it_is_told_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    default = inspect.signature(ZenohRouter).parameters["listen"].default
+    assert default == zenoh_router.ROUTER
+    assert re.fullmatch(r"tcp/127\.0\.0\.1:\d+", default)
+    # Where the default cannot be listened at, the command says where it would have been.
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        monkeypatch.setattr(zenoh_router, "ROUTER", f"tcp/127.0.0.1:{taken.getsockname()[1]}")
+        with pytest.raises(UsageError, match=f"cannot listen at {zenoh_router.ROUTER}"):
+            router()
 
 
 @pytest.mark.anyio

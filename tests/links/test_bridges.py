@@ -7,7 +7,7 @@ from support.domains import Network, Process, SlowWorld, World
 from support.foreign_world import ForeignMessage, ForeignTransform, ForeignWorld
 from support.samples import moving, static
 
-from tfbus.links.carrier import SendReport
+from tfbus.links.seams import SendReport
 
 ARM = ForeignTransform("map", "arm", 5, 1.0)
 

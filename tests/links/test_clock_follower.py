@@ -4,7 +4,7 @@ from support.asking import settle
 from support.processes import until
 
 from tfbus import SECOND, Buffer, Bus, ClockResetError, SimulatedClock
-from tfbus.links.clock_follower import FAR, ClockFollower
+from tfbus.links.link import FAR, ClockFollower
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 
@@ -71,20 +71,6 @@ async def test_a_step_back_is_one_jump_even_while_the_clock_advances() -> None:
             await settle()
             assert resets == 1
             tasks.cancel_scope.cancel()
-
-
-async def test_it_follows_to_the_nanosecond() -> None:
-    clock = SimulatedClock(THEN)
-    follower = ClockFollower(clock)
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(follower.run)
-        await settle()
-        assert clock.now() == THEN, "nothing was heard yet"
-        follower.hear(THEN)
-        for nanoseconds in (1, 2, 5):
-            follower.hear(THEN + nanoseconds)
-            await until(lambda stamp=THEN + nanoseconds: clock.now() == stamp)  # type: ignore[misc]
-        tasks.cancel_scope.cancel()
 
 
 @pytest.mark.parametrize(("further", "jumped"), [(0, False), (1, True)])

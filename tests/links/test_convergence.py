@@ -221,7 +221,9 @@ def test_copies_that_agree_cost_signs_only_and_ever_fewer() -> None:
         process.say(*(static("map", f"{place}/{number}") for number in range(100)))
     world.run(10.0)
     network.sent()
+    received = [process.received for process in processes]
     world.run(100.0)
+    assert [process.received for process in processes] == received, "a sign without news has woken an event loop"
     others = set(Kind) - {Kind.SIGN}
     assert sum(kind in others for kind, _ in network.carried) == 0
     assert network.sent(Kind.SIGN) <= 4 * 3 * 51

@@ -1,4 +1,3 @@
-import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from itertools import count, pairwise
@@ -13,10 +12,11 @@ from support.processes import until
 from support.samples import moving, static
 
 from tfbus import Bus, PeerJoined, PeerLost, PeerRejected, SimulatedClock
+from tfbus._aio.turn_budget import TurnBudget
 from tfbus.links import Link
-from tfbus.links.carrier import Presence, Received, ReceivedMessage, SendReport
 from tfbus.links.endpoint import ForeignEnd
-from tfbus.links.outbox import Turn
+from tfbus.links.relay import Turn
+from tfbus.links.seams import Presence, Received, ReceivedMessage, SendReport
 from tfbus.tf_message import MalformedMessageError
 
 pytestmark = pytest.mark.anyio
@@ -80,10 +80,14 @@ def link_of(
     return Link(ForeignEnd(bus, "world", carrier, frames, drop_lost, max_frames), **options)
 
 
-def slow_clock(step: float) -> Callable[[], float]:
-    """A monotonic clock for which so many s pass from one look to the next."""
+def slow_budget(step: float) -> TurnBudget:
+    """A budget by a clock for which so many s pass from one look to the next."""
     looks = count()
-    return lambda: next(looks) * step
+
+    def clock() -> float:
+        return next(looks) * step
+
+    return TurnBudget(now=clock, busy=clock)
 
 
 async def receive_samples(link: Link, samples: int) -> None:
@@ -138,18 +142,6 @@ async def test_what_comes_while_the_carrier_opens_is_published_when_the_link_has
             assert bus.statistics().frames == 1
 
 
-async def test_the_error_of_the_body_comes_out_as_it_is_and_the_last_turn_goes_out() -> None:
-    carrier = LoggedCarrier()
-    with Bus() as bus, pytest.raises(MineError) as caught:
-        async with link_of(bus, carrier):
-            await until(lambda: "run" in carrier.calls)
-            bus.publish(moving("map", "a", 1))
-            raise MineError
-    assert caught.value.__cause__ is None
-    assert caught.value.__context__ is None
-    assert carrier.calls == ["open", "run", "send 1", "close"]
-
-
 @pytest.mark.every_loop
 async def test_what_was_published_last_goes_out_while_the_carrier_still_runs() -> None:
     class EndingCarrier(LoggedCarrier):
@@ -170,7 +162,7 @@ async def test_what_was_published_last_goes_out_while_the_carrier_still_runs() -
 async def test_threads_may_bring_messages_in_any_number_and_the_loop_has_time_for_others() -> None:
     carrier = LoggedCarrier()
     with Bus() as bus:
-        async with link_of(bus, carrier, now=slow_clock(0.0001)) as link:
+        async with link_of(bus, carrier, budget=slow_budget(0.0001)) as link:
 
             def bring() -> None:
                 for stamp in range(2_000):
@@ -208,7 +200,7 @@ class SplittingForeignCarrier(LoggedCarrier):
 async def test_a_message_that_its_carrier_splits_takes_several_turns_and_is_counted_once() -> None:
     carrier = SplittingForeignCarrier(fails="broken")
     with Bus() as bus:
-        async with link_of(bus, carrier, now=slow_clock(0.001)) as link:
+        async with link_of(bus, carrier, budget=slow_budget(0.001)) as link:
             many = [ARM._replace(child=f"arm{number}", stamp=1) for number in range(50)]
             carrier.receive(Received("driver", ForeignMessage(False, [*many, ARM._replace(child="broken"), ARM])))
             carrier.receive(Received("driver", ForeignMessage(False, [ARM._replace(stamp=2)])))
@@ -224,7 +216,7 @@ async def test_a_message_that_its_carrier_splits_takes_several_turns_and_is_coun
 async def test_the_rest_of_a_split_message_is_dropped_when_the_clock_jumps_back() -> None:
     clock, carrier = SimulatedClock(start=10), SplittingForeignCarrier()
     with Bus(clock) as bus:
-        async with link_of(bus, carrier, now=slow_clock(0.001)) as link:
+        async with link_of(bus, carrier, budget=slow_budget(0.001)) as link:
             many = [ARM._replace(child=f"arm{number}") for number in range(50)]
             carrier.receive(Received("driver", ForeignMessage(False, many), moving=True))
             while link.statistics().received_samples < 5:
@@ -233,22 +225,6 @@ async def test_the_rest_of_a_split_message_is_dropped_when_the_clock_jumps_back(
             carrier.receive(Received("driver", ForeignMessage(False, [ARM._replace(child="last")])))
             await until(lambda: link.statistics().received_messages == 2)
             assert link.statistics().received_samples < 50
-
-
-async def test_moving_items_that_wait_when_the_clock_jumps_back_are_dropped() -> None:
-    clock, carrier = SimulatedClock(start=10), LoggedCarrier()
-    with Bus(clock) as bus:
-        async with link_of(bus, carrier) as link:
-            for is_static in (False, True):
-                message = ForeignMessage(is_static, [ARM._replace(child=f"{is_static}")])
-                carrier.receive(Received("driver", message, moving=not is_static))
-            for now in (20, 20):
-                clock.set(now)
-                assert link.statistics().queue.dropped == 0
-            clock.set(5)
-            await receive_samples(link, 1)
-            assert link.statistics().queue.dropped == 1
-            assert bus.statistics().frames == 1
 
 
 async def test_a_sample_that_comes_once_more_is_news_again_when_the_clock_has_jumped_back() -> None:
@@ -300,19 +276,6 @@ async def test_only_wanted_frames_go_out_and_come_in() -> None:
             await until(lambda: link.statistics().sent_samples == 1)
         assert bus.statistics().samples == 3
     assert world.published[-1] == ("tfbus", ForeignMessage(False, [ForeignTransform("map", "base", 1, 0.0)]))
-
-
-async def test_what_is_not_sent_is_counted_each_time_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    class RefusingCarrier(LoggedCarrier):
-        async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
-            await super().open(receive, report)
-            for _ in range(2):
-                report.refused("frame name", ValueError("the name is too long"))
-
-    with Bus() as bus, caplog.at_level(logging.WARNING, "tfbus"):
-        async with link_of(bus, RefusingCarrier()) as link:
-            assert link.statistics().not_sent == {"frame name": 2}
-    assert caplog.messages == ["not sent over the link world: the name is too long"]
 
 
 async def test_a_link_drives_a_clock_that_follows_and_tells_the_time_of_its_own() -> None:

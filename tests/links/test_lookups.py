@@ -13,6 +13,7 @@ from support.asking import Asked, settle
 from support.memory_wire import MemoryNetwork, MemoryWire
 from support.processes import until
 from support.samples import moving, static
+from trio.testing import MockClock
 
 from tfbus import (
     LATEST,
@@ -28,10 +29,20 @@ from tfbus import (
     TransformStamped,
     UnknownFrameError,
 )
-from tfbus.links import BufferServer, DomainLink, lookups
-from tfbus.links.message import Kind, Outgoing, kind_of, write_body, write_message
-from tfbus.links.remote_lookup import Cancellation, RemoteQuestion, read_answer, write_answer, write_question
-from tfbus.links.wire import Hearing
+from tfbus.links import BufferServer, DomainLink
+from tfbus.links.message import (
+    Cancellation,
+    Kind,
+    Outgoing,
+    RemoteQuestion,
+    kind_of,
+    read_answer,
+    write_answer,
+    write_body,
+    write_message,
+    write_question,
+)
+from tfbus.links.seams import Hearing
 
 pytestmark = pytest.mark.anyio
 
@@ -246,9 +257,13 @@ async def test_a_thousand_lookups_at_once_are_each_answered() -> None:
 
 # The time of a lookup
 
+in_simulated_time = pytest.mark.parametrize(
+    "anyio_backend", [("trio", {"clock": MockClock(autojump_threshold=0)})], ids=["simulated"]
+)
 
-async def test_a_long_wait_is_asked_for_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lookups, "LONGEST_WAIT", 0.05)
+
+@in_simulated_time
+async def test_a_long_wait_is_asked_for_in_parts() -> None:
     async with asked() as scene, anyio.create_task_group() as tasks:
         waiting = Asked(tasks, lambda: scene.lookup("map", "base"))
         await until(lambda: scene.server.statistics().failed >= 2)
@@ -256,17 +271,14 @@ async def test_a_long_wait_is_asked_for_in_parts(monkeypatch: pytest.MonkeyPatch
         await until(lambda: waiting.ended)
         assert waiting.answer.static
         with pytest.raises(LookupTimeoutError) as late:
-            await scene.lookup("map", "nothing", timeout=0.12)
-        assert late.value.timeout == 0.12
+            await scene.lookup("map", "nothing", timeout=25.0)
+        assert late.value.timeout == 25.0
         assert isinstance(late.value.__cause__, UnknownFrameError)
 
 
+@in_simulated_time
 @pytest.mark.parametrize("lost", [Kind.LOOKUP, Kind.LOOKUP_ANSWER])
-async def test_what_is_dropped_is_asked_again_and_a_silent_server_is_given_up(
-    lost: Kind, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(lookups, "PATIENCE", 0.02)
-    monkeypatch.setattr(lookups, "LONGEST_WAIT", 0.05)
+async def test_what_is_dropped_is_asked_again_and_a_silent_server_is_given_up(lost: Kind) -> None:
     async with asked() as scene:
         scene.bus.publish(static("map", "base"))
         await scene.lookup("map", "base")
@@ -283,7 +295,7 @@ async def test_what_is_dropped_is_asked_again_and_a_silent_server_is_given_up(
 
         scene.network.lose = lose(2)
         assert (await scene.lookup("map", "base")).static
-        for timeout in (None, 0.02):
+        for timeout in (None, 2.0):
             dropped.clear()
             scene.network.lose = lose(100)
             with pytest.raises(RemoteLookupError) as silent:

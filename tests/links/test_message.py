@@ -37,8 +37,7 @@ from tfbus.links.message import (
     write_message,
     write_text,
 )
-from tfbus.links.outbox import OutgoingBatch, RemovedFrame
-from tfbus.links.relay import ReceivedBatch
+from tfbus.links.relay import OutgoingBatch, ReceivedBatch, RemovedFrame
 from tfbus.links.replica import Claim
 from tfbus.tf_message import MalformedMessageError, encode
 

@@ -1,12 +1,9 @@
-import threading
-from collections import Counter
-from functools import partial
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.links.carrier import MANY, Presence, Received, ReceiveQueue
+from tfbus.links.link import MANY, ReceiveQueue
+from tfbus.links.seams import Presence, Received
 from tfbus.statistics import QueueStatistics
 
 MIB = 2**20
@@ -35,16 +32,6 @@ def drained(queue: ReceiveQueue) -> list[object]:
     while (item := queue.get()) is not None:
         contents.append(item.content)
     return contents
-
-
-def test_items_are_read_in_the_order_in_which_they_came() -> None:
-    queue = ReceiveQueue(10)
-    assert queue.get() is None
-    for item in (moving(1), kept(2), moving(3), kept(True)):
-        queue.put(item)
-    assert len(queue) == 4
-    assert drained(queue) == [1, 2, 3, True]
-    assert (len(queue), queue.get()) == (0, None)
 
 
 @pytest.mark.parametrize("waiting", [0, 1, MANY - 1, MANY])
@@ -122,14 +109,6 @@ def test_nothing_is_lost_and_of_each_peer_only_its_coming_overtakes(steps: list[
         assert sorted(got[sender], key=lambda item: item[0]) == items
         in_order = [item for item in items if item[1] is not Presence.JOINED]
         assert [item for item in got[sender] if item[1] is not Presence.JOINED] == in_order
-
-
-def test_beyond_the_capacity_the_oldest_moving_items_are_dropped_and_the_others_stay_in_order() -> None:
-    queue = ReceiveQueue(2)
-    for item in (kept("a"), moving(1), kept("b"), moving(2), moving(3), kept("c"), moving(4)):
-        queue.put(item)
-    assert queue.statistics() == QueueStatistics("link", "drop_oldest", 2, pending=5, dropped=2)
-    assert drained(queue) == ["a", "b", 3, "c", 4]
 
 
 def test_items_that_do_not_move_take_no_room_from_moving_ones() -> None:
@@ -232,39 +211,3 @@ def test_the_queue_behaves_like_a_list(capacity: int, steps: list[str]) -> None:
         dropped += len(gone)
         assert (len(queue), queue.statistics().dropped) == (len(model), dropped)
     assert drained(queue) == [item.content for item in model]
-
-
-def test_threads_that_put_and_get_at_once_lose_nothing_uncounted_and_keep_the_order() -> None:
-    queue = ReceiveQueue(50)
-    done = threading.Event()
-    taken: list[list[Received]] = [[], []]
-
-    def put(name: str) -> None:
-        for number in range(5_000):
-            queue.put(Received(name, number, 10, moving=number % 3 > 0))
-
-    def take(into: list[Received]) -> None:
-        while not done.is_set() or len(queue):
-            item = queue.get()
-            if item is not None:
-                into.append(item)
-
-    takers = [threading.Thread(target=partial(take, into)) for into in taken]
-    putters = [threading.Thread(target=partial(put, name)) for name in "abcd"]
-    for thread in (*takers, *putters):
-        thread.start()
-    for thread in putters:
-        thread.join(60)
-    done.set()
-    for thread in takers:
-        thread.join(60)
-        assert not thread.is_alive()
-    everything = [item for into in taken for item in into]
-    assert len(everything) + queue.statistics().dropped == 20_000
-    assert Counter(item.sender for item in everything if not item.moving) == dict.fromkeys("abcd", 1_667)
-    assert len({(item.sender, item.content) for item in everything}) == len(everything)
-    for into in taken:
-        last: dict[str, int] = {}
-        for item in into:
-            assert item.content > last.get(item.sender, -1)
-            last[item.sender] = item.content

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import strategies as some
-from support.domains import Network, Process, World, agree
+from support.domains import Network, Process, Stranger, World, agree
 from support.processes import peak_of
 from support.samples import moving, static
 
@@ -259,6 +259,27 @@ def test_a_frame_that_a_lost_bus_has_taken_over_is_gone_until_it_is_said_again()
     assert one.frames == three.frames == late.frames == {"tool": static("map", "tool", 3.0)}
 
 
+@pytest.mark.parametrize("drop_lost", [False, True])
+@pytest.mark.parametrize("late", [False, True])
+def test_what_a_lost_bus_has_said_does_not_take_a_frame_over_when_it_is_late_and_is_not_heard_again(
+    late: bool, drop_lost: bool
+) -> None:
+    world = World()
+    network = Network(world)
+    listener = world.process(network, drop_lost=drop_lost)
+    old, new, bridge = (Stranger(network) for _ in range(3))
+    said = old.batch(moving("map", "base", 1), number=10)
+    # A program that was started again may be read first.
+    sayings = [lambda: old.say(said), lambda: new.say(new.batch(moving("map", "base", 2), number=20))]
+    for say in sayings[:: -1 if late else 1]:
+        say()
+    network.remove(old)
+    world.run(1.0)
+    assert listener.frames == {"base": moving("map", "base", 2)}
+    bridge.say(said)
+    assert len(listener.seen) == 2
+
+
 def test_what_was_said_beyond_a_bridge_that_was_cut_off_holds_against_what_was_said_before() -> None:
     for seed in range(10):
         world, (near, bridge, far) = domains([[0, 1], [1, 2]], drop_lost=True, seed=seed)
@@ -392,30 +413,3 @@ def test_a_sample_is_known_by_child_parent_stamp_and_kind_and_a_static_one_by_it
     first: TransformStamped, second: TransformStamped, same: bool
 ) -> None:
     assert (second in passed(first)) is same
-
-
-def test_so_many_samples_of_each_child_are_remembered_and_what_passes_again_is_new() -> None:
-    samples = [moving("map", "a", stamp) for stamp in range(5)]
-    memory = passed(moving("map", "b", 0), *samples[:3], samples[0], samples[3])
-    assert [sample in memory for sample in samples] == [True, False, True, True, False]
-    assert moving("map", "b", 0) in memory
-
-
-def test_children_that_left_are_remembered_up_to_a_bound_and_one_that_came_back_as_before() -> None:
-    memory = passed(*(moving("map", name, 1) for name in ("back", "stays", *"abc")))
-    memory.retire("back")
-    memory.add(moving("map", "back", 2))
-    for name in ("never there", *"abac"):
-        memory.retire(name)
-    known = {name: moving("map", name, 1) in memory for name in ("back", "stays", *"abc")}
-    assert known == {"back": True, "stays": True, "a": True, "b": False, "c": True}
-
-
-def test_after_a_jump_back_only_static_samples_are_known_and_of_a_forgotten_child_none() -> None:
-    samples = moving("map", "a", 1), static("map", "a"), moving("map", "b", 1), static("map", "c")
-    memory = passed(*samples)
-    memory.retire("b")
-    memory.forget_moving()
-    memory.forget("c")
-    memory.forget("never there")
-    assert [sample in memory for sample in samples] == [False, True, False, False]

@@ -2,16 +2,11 @@
 
 import random
 from collections.abc import Iterable
-from math import inf
 
 import pytest
-from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
-from support.processes import peak_of
 from support.samples import moving, static
 
-from tfbus import TransformStamped
-from tfbus.links.outbox import OutgoingBatch, RemovedFrame
+from tfbus.links.relay import OutgoingBatch, RemovedFrame
 from tfbus.links.replica import (
     CHUNK,
     MANY_ORIGINS,
@@ -28,111 +23,10 @@ from tfbus.links.replica import (
 
 OWN, OTHER = b"the own bus.....", b"another bus....."
 Model = dict[str, tuple[int, bytes]]
-NAMES = "abcdef"
-
-
-def said(frame: str, number: int) -> TransformStamped | None:
-    """An entry of a frame with a number: a removal, a static or a moving sample."""
-    return (None, static("map", frame, stamp=number), moving("map", frame, number))[number % 3]
-
-
-def rank_of(told: OutgoingBatch | RemovedFrame) -> tuple[str, tuple[int, bytes]]:
-    frame = told.frame if isinstance(told, RemovedFrame) else told.samples[0].child
-    sample = None if isinstance(told, RemovedFrame) else told.samples[0]
-    assert sample == said(frame, told.sequence)
-    return frame, (told.sequence, told.origin)
 
 
 def ranks_in(replica: Replica) -> Model:
     return {frame: (entry.number, entry.origin) for frame, entry in replica.entries.items()}
-
-
-class Copies(RuleBasedStateMachine):
-    """Two copies that hear of different things, and one asker of each, which learns by answers only."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.now = 100.0
-        self.copies = [Replica(100, OWN), Replica(100, OWN)]
-        self.models: list[Model] = [{}, {}]
-        self.learnt: list[Model] = [{}, {}]
-        self.seen = [0, 0]
-
-    @rule(which=st.integers(0, 1), frame=st.sampled_from(NAMES), number=st.integers(1, 12), own=st.booleans())
-    def note(self, which: int, frame: str, number: int, own: bool) -> None:
-        rank = number, OWN if own else OTHER
-        sample = said(frame, number)
-        settles = sample is not None and not sample.static
-        is_new = self.copies[which].note(frame, rank, sample, ours=own, settles=settles)
-        assert is_new is (rank > self.models[which].get(frame, (-1, b"")))
-        if is_new:
-            self.models[which][frame] = rank
-
-    @rule(seconds=st.sampled_from((0.0, 0.5, SETTLING, 100.0)), look=st.booleans())
-    def wait(self, seconds: float, look: bool) -> None:
-        self.now += seconds
-        if look:
-            for copy in self.copies:
-                copy.claim(self.now)
-
-    @rule(which=st.integers(0, 1), limit=st.sampled_from((1, 2, CHUNK)))
-    def ask(self, which: int, limit: int) -> None:
-        """An answer tells changes up to a sequence, and the last one all that is new."""
-        since = self.seen[which]
-        told, claim = self.copies[which].changes(since, self.now, limit=limit)
-        assert claim.since == since
-        assert len(told) <= limit
-        assert claim.sequence > since or claim.final
-        self.learnt[which].update(map(rank_of, told))
-        self.seen[which] = claim.sequence
-        if claim.final:
-            assert self.learnt[which] == self.models[which]
-            assert claim == self.copies[which].claim(self.now)._replace(since=since)
-
-    @rule(which=st.integers(0, 1))
-    def begin_anew(self, which: int) -> None:
-        """A sequence that was never reached is answered with the beginning of all."""
-        told, claim = self.copies[which].changes(10**9, self.now)
-        assert (claim.since, claim.final) == (0, True)
-        assert dict(map(rank_of, told)) == self.models[which]
-        assert len(told) == len(self.models[which])
-
-    @rule()
-    def exchange(self) -> None:
-        """Each tells the other all; then both have the same, in whatever order it came."""
-        answers = [copy.changes(0, self.now)[0] for copy in self.copies]
-        for copy, model, answer in zip(self.copies, self.models, reversed(answers), strict=True):
-            for frame, rank in map(rank_of, answer):
-                copy.note(frame, rank, said(frame, rank[0]))
-                model[frame] = max(rank, model.get(frame, rank))
-        assert self.models[0] == self.models[1]
-
-    @rule(frames=st.none() | st.sets(st.sampled_from(NAMES)))
-    def settle(self, frames: set[str] | None) -> None:
-        """Once all has settled, digests are equal if the entries are, removals among them, and only then."""
-        for _ in range(2):
-            claims = [copy.claim(self.now, frames) for copy in self.copies]
-            self.now += SETTLING
-        parts = [{f: rank for f, rank in model.items() if frames is None or f in frames} for model in self.models]
-        assert (claims[0].digest == claims[1].digest) is (parts[0] == parts[1])
-        told = [dict(map(rank_of, copy.changes(0, self.now, frames)[0])) for copy in self.copies]
-        assert told == parts
-
-    @invariant()
-    def it_holds_the_highest_of_each_frame(self) -> None:
-        assert [ranks_in(copy) for copy in self.copies] == self.models
-        for copy in self.copies:
-            for frame, entry in copy.entries.items():
-                assert entry.sample == said(frame, entry.number)
-            here = [f for f, entry in copy.entries.items() if entry.ours and entry.sample is not None]
-            ours = copy.ours(len(NAMES))
-            assert ours is not None
-            assert sorted(frame for frame, _ in map(rank_of, ours)) == sorted(here)
-            assert (copy.ours(len(here) - 1) is None) is (len(here) > 0)
-            assert copy.moving() == sorted(f for f in here if copy.entries[f].number % 3 == 2)
-
-
-TestCopies = Copies.TestCase
 
 
 def filled(frames: Iterable[str], number: int = 1, origin: bytes = OTHER, max_frames: int = 100) -> Replica:
@@ -160,26 +54,6 @@ def test_of_two_samples_of_one_batch_the_newer_is_held() -> None:
     assert not replica.note("a", (1, OTHER), moving("map", "a", 4))
     assert replica.note("a", (1, OTHER), moving("map", "a", 6))
     assert not replica.note("a", (1, OTHER), None)
-
-
-def test_a_bus_has_so_many_frames_and_all_together_so_many_times_more() -> None:
-    replica = filled("ab", max_frames=2)
-    with pytest.raises(TooManyEntriesError, match="more than 2 frames"):
-        replica.note("c", (2, OTHER), static("map", "c"))
-    assert sorted(replica.entries) == ["a", "b"]
-    replica.note("b", (2, OTHER), static("map", "b", 2.0))
-    replica.note("a", (2, OTHER), None)
-    replica.note("c", (3, OTHER), static("map", "c"))
-    # A frame that another bus has taken over counts for that one.
-    replica.note("c", (4, b"a third"), static("map", "c"))
-    replica.note("d", (4, OTHER), static("map", "d"))
-    for number in range(100):
-        replica.note(f"own {number}", (1, OWN), static("map", f"own {number}"), ours=True)
-    replica = Replica(2, OWN)
-    for number in range(2 * MANY_ORIGINS):
-        replica.note(f"{number}", (1, b"%16d" % number), static("map", f"{number}"))
-    with pytest.raises(TooManyEntriesError):
-        replica.note("more", (1, b"one more origin."), static("map", "more"))
 
 
 def test_removals_take_no_room_of_frames() -> None:
@@ -217,21 +91,6 @@ def test_copies_forget_the_same_removals_in_whatever_order_they_come() -> None:
         chunk, claim = copies[0].changes(claim.sequence, 1e6)
         told |= {entry.frame for entry in chunk if isinstance(entry, RemovedFrame)}
     assert told == expected
-
-
-@pytest.mark.thorough
-def test_frames_that_come_go_and_change_for_ever_take_no_more_memory() -> None:
-    replica = filled("a")
-    numbers = iter(range(2, 10**9))
-
-    def change() -> None:
-        for _ in range(40_000):
-            replica.note("a", (next(numbers), OTHER), static("map", "a"))
-            replica.note("b", (next(numbers), OTHER), None)
-            replica.claim(1.0)
-
-    change()
-    assert peak_of(change) < 4_500_000
 
 
 # Whom to ask, and when
@@ -300,43 +159,6 @@ def test_the_first_peer_is_asked_for_all_at_once_and_others_only_if_they_differ(
     link.answer(question)
     assert link.next_question() is None
     assert ranks_in(link.replica) == ranks_in(link.peers["b"])
-
-
-def test_equal_digests_need_no_question_and_what_comes_meanwhile_makes_one_needless() -> None:
-    link = Asker("a")
-    link.answer(link.next_question() or Question("", 0))
-    for _ in range(10):
-        link.say("a")
-        link.sign("a")
-        assert link.next_question(10.0) is None
-    link.say("a", heard=False)
-    link.sign("a")
-    assert link.agreement.next_due() < inf
-    link.replica.note("f11", (11, OTHER), static("map", "f11"))
-    assert link.next_question(10.0) is None
-
-
-def test_much_is_told_in_chunks_one_behind_the_other() -> None:
-    link = Asker("a")
-    for _ in range(25):
-        link.say("a", heard=False)
-    questions = []
-    while (question := link.next_question(0.0)) is not None:
-        questions.append(question.since)
-        link.answer(question, limit=10)
-    assert questions == [0, 10, 20]
-    assert ranks_in(link.replica) == ranks_in(link.peers["a"])
-
-
-def test_a_missing_live_message_is_a_reason_to_ask_soon_whatever_the_digests() -> None:
-    link = Asker("a")
-    link.answer(link.next_question() or Question("", 0))
-    link.sign("a")
-    link.agreement.missed("a", link.now)
-    asked_from = link.now
-    assert link.next_question() == Question("a", 0)
-    assert 0.05 <= link.now - asked_from <= 0.2
-    link.agreement.missed("nobody", link.now)
 
 
 def test_a_peer_that_comes_back_is_asked_for_what_is_new() -> None:

@@ -1,7 +1,6 @@
 """A link whose peer is a stranger: the test writes the messages that come, as any program that reaches it could."""
 
 import math
-import random
 import struct
 from collections.abc import Sequence
 from typing import Any
@@ -14,10 +13,9 @@ from support.domains import Network, Stranger, World
 from support.samples import moving, static
 
 from tfbus import PeerLost, PeerRejected, TransformStamped
+from tfbus.links.endpoint import MAX_AUTHORITIES, MAX_PEERS
 from tfbus.links.message import Kind, Outgoing, read_message, write_body, write_message, write_text
-from tfbus.links.outbox import OutgoingBatch, RemovedFrame
-from tfbus.links.peers import MAX_AUTHORITIES, MAX_PEERS
-from tfbus.links.relay import LARGEST_JUMP
+from tfbus.links.relay import LARGEST_JUMP, OutgoingBatch, RemovedFrame
 from tfbus.links.replica import MANY_ORIGINS, Claim
 
 HERE, OTHER, THIRD = b"the stranger's..", b"one more origin.", b"and a third one."
@@ -123,6 +121,7 @@ def test_what_comes_again_or_late_is_counted_and_what_this_bus_has_said_is_no_ne
     for number in (2, 2, 1, 3):
         scene.say(moving("map", "a", number), number=number)
     assert scene.counts == (2, 2)
+    scene.stranger.say(kind=Kind.SIGN, reach=[(OTHER, ())])
     scene.say(moving("map", "a", 2), number=2, origin=OTHER)
     assert scene.counts == (3, 2), "another origin is another source"
     scene.say(static("map", "own"), number=0, origin=scene.origin)
@@ -431,27 +430,6 @@ def test_a_bus_that_a_peer_says_it_reaches_is_there_while_it_says_so() -> None:
 
 
 # Anything at all
-
-
-def test_many_damaged_messages_do_no_harm() -> None:
-    chance = random.Random(2)
-    scene = Scene(max_frames=50)
-    samples = [moving("map", "a", 1, authority="slam"), static("a", "b"), moving("b", "c", 1), moving("map", "d", 2)]
-    first, second = OutgoingBatch(HERE, scene.first, samples[:2]), OutgoingBatch(OTHER, scene.first, samples[2:])
-    others = [scene.stranger, Stranger(scene.network), Stranger(scene.network)]
-    scene.process.bus.subscribe(lambda _: None, lambda _: None)
-    for _ in range(1_500):
-        kind = chance.choice([Kind.LIVE, Kind.SIGN, Kind.MEETING, Kind.ANSWER, Kind.PAST])
-        out = Outgoing(kind, HERE, 1, Claim(1, 2, 3), 4, [(THIRD, (OTHER,))])
-        data = bytearray(write_message(out, [first, RemovedFrame(OTHER, 1, "c"), second]))
-        for _ in range(chance.randrange(1, 4)):
-            data[chance.randrange(len(data))] = chance.randrange(256)
-        chance.choice(others).say_bytes(bytes(data))
-    scene.world.run(100.0)
-    assert scene.process.bus.statistics().callbacks_failed == 0
-    assert scene.process.end.messages > 300
-    assert sum(scene.rejected.values()) > 300
-    assert scene.process.bus.statistics().frames <= 150
 
 
 entries_of_any_kind = st.lists(

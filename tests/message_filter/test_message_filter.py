@@ -31,7 +31,6 @@ from tfbus import (
     PastExtrapolationError,
     PointStamped,
     SimulatedClock,
-    Transform,
     TransformStamped,
     UnknownFrameError,
 )
@@ -118,14 +117,6 @@ def put(streams: Streams, *messages: Scan) -> None:
 
 
 # The tests of tf2's own filter
-
-
-async def test_a_message_in_the_target_frame_is_delivered_without_transforms(buffer: Buffer, streams: Streams) -> None:
-    put(streams, Scan(5, "map"))
-    async with MessageFilter(streams.receive, buffer, "map") as pairs:
-        message, found = await anext(pairs)
-    assert message == Scan(5, "map")
-    assert (found.parent, found.child, found.stamp, found.transform) == ("map", "map", 5, Transform.identity())
 
 
 @pytest.mark.every_loop
@@ -262,26 +253,6 @@ async def test_stamped_data_are_messages_and_may_be_stamped_latest(bus: Bus, buf
 
 
 # Orders
-
-
-@pytest.mark.parametrize(
-    ("order", "expected"), [("ready", [4, 2, 3, 1, 5]), ("stamp", [1, 2, 3, 4, 5]), ("arrival", [5, 3, 1, 4, 2])]
-)
-async def test_messages_are_delivered_in_the_given_order(
-    order: Any, expected: list[int], bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    got: list[Pair] = []
-    frames = {5: "five", 3: "three", 1: "one", 4: "four", 2: "two"}
-    async with anyio.create_task_group() as tasks, MessageFilter(streams.receive, buffer, "map", order=order) as pairs:
-        put(streams, *(Scan(stamp, frame) for stamp, frame in frames.items()))
-        await settle()
-        for stamp in (4, 2, 3, 1, 5):
-            bus.publish(moving("map", frames[stamp], stamp))
-            await settle()
-        tasks.start_soon(read, pairs, got)
-        await settle()
-        assert stamps(got) == expected
-        tasks.cancel_scope.cancel()
 
 
 # Time

@@ -21,15 +21,26 @@ from tfbus import LATEST, Buffer, Bus, PeerRejected
 from tfbus.links import BufferServer, DomainLink
 from tfbus.links.channels import MOST_FILTERS
 from tfbus.links.domain import SOONEST_SIGN
+from tfbus.links.endpoint import MAX_PEERS, MOST_AUTHORITY_TEXT, Peers
 from tfbus.links.history import MOST_HELD_SAMPLES, HistoryAsker
 from tfbus.links.local import LocalLink
-from tfbus.links.message import NOTHING, Entry, Heard, Kind, Outgoing, kind_of, write_body, write_message, write_text
-from tfbus.links.outbox import OutgoingBatch, RemovedFrame
-from tfbus.links.peers import MAX_PEERS, MOST_AUTHORITY_TEXT, Peers
-from tfbus.links.relay import ReceivedBatch
-from tfbus.links.remote_lookup import Cancellation, RemoteQuestion, write_question
-from tfbus.links.replica import MANY_ORIGINS, MOST_REMOVALS, SETTLING, Claim, Places, Replica, TooManyEntriesError
-from tfbus.links.wire import Hearing, Joined, Left
+from tfbus.links.message import (
+    NOTHING,
+    Cancellation,
+    Entry,
+    Heard,
+    Kind,
+    Outgoing,
+    RemoteQuestion,
+    kind_of,
+    write_body,
+    write_message,
+    write_question,
+    write_text,
+)
+from tfbus.links.relay import OutgoingBatch, ReceivedBatch, RemovedFrame
+from tfbus.links.replica import MANY_ORIGINS, MOST_REMOVALS, Claim, Places, Replica, TooManyEntriesError
+from tfbus.links.seams import Hearing, Joined, Left
 
 pytestmark = pytest.mark.anyio
 
@@ -376,18 +387,6 @@ async def test_whatever_a_stranger_says_the_others_agree_and_what_is_refused_is_
 
 
 # Defects that were found
-
-
-def test_a_removal_that_is_pushed_out_before_its_frame_has_settled_does_no_harm() -> None:
-    replica = Replica(10, OTHER)
-    replica.note("gone", (1, BUS), moving("map", "gone", 1), settles=True)
-    replica.claim(0.0)
-    replica.note("gone", (2, BUS), None)
-    for number in range(MOST_REMOVALS):
-        replica.note(f"r{number}", (3 + number, BUS), None)
-    replica.claim(SETTLING)
-    assert "gone" not in replica.entries
-    assert len(replica.entries) == MOST_REMOVALS
 
 
 @pytest.mark.thorough

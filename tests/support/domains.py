@@ -15,13 +15,13 @@ from support.foreign_world import ForeignCarrier, ForeignMessage, ForeignWorld
 
 from tfbus import Bus, SimulatedClock, Transform, TransformStamped, UnknownFrameError
 from tfbus.geometry.stamped import Batch
-from tfbus.links.carrier import Received, ReceiveQueue
 from tfbus.links.domain import DomainEnd
 from tfbus.links.endpoint import Endpoint, ForeignEnd
+from tfbus.links.link import ReceiveQueue
 from tfbus.links.message import NOTHING, Kind, Outgoing, kind_of, write_message
-from tfbus.links.outbox import OutgoingBatch, RemovedFrame
+from tfbus.links.relay import OutgoingBatch, RemovedFrame
 from tfbus.links.replica import Claim
-from tfbus.links.wire import Hearing, Joined, Left, Receive, WireItem
+from tfbus.links.seams import Hearing, Joined, Left, Receive, Received, WireItem
 from tfbus.tf_message import MalformedMessageError
 
 SECOND = 10**9
@@ -146,7 +146,7 @@ class Network:
 
 
 class Wire:
-    """See `tfbus.links.wire.Wire`; the end of the link that uses it calls it without an event loop."""
+    """See `tfbus.links.seams.Wire`; the end of the link that uses it calls it without an event loop."""
 
     def __init__(self, network: Network, robot: str = "") -> None:
         self.network = network
@@ -180,6 +180,9 @@ class Wire:
 
     def is_heard(self, channel: str) -> bool:
         return any(other.channel_of(self) == channel for other in self.network.wires if other is not self)
+
+    def is_behind(self) -> bool:
+        return False
 
     def publish(self, channel: str, message: bytes) -> None:
         for other in self.network.wires:
@@ -260,9 +263,11 @@ class Host:
         self._end = end
         self._queue = ReceiveQueue(10_000)
         self._handles = False
+        self.received = 0
         end.host = self
 
     def receive(self, item: Received) -> None:
+        self.received += 1
         if self._process.stopped and len(self._queue) >= BACKLOG and isinstance(item.content, bytes):
             return
         self._queue.put(item)
@@ -286,6 +291,9 @@ class Host:
     def send_soon(self, pending: int) -> None:
         del pending
         self._process.sending = True
+
+    def is_behind(self) -> bool:
+        return len(self._queue) > 0
 
     def stir(self) -> None:
         self._process.due = self._process.world.now
@@ -320,6 +328,11 @@ class Process:
         self.removed: list[str] = []
         self._hosts = [Host(self, end) for end in self.ends]
         self.bus.subscribe(self._note, self._note_removal)
+
+    @property
+    def received(self) -> int:
+        """So many items of its networks and worlds had to wait for its event loop."""
+        return sum(host.received for host in self._hosts)
 
     @property
     def end(self) -> DomainEnd:

@@ -4,9 +4,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from tfbus import InvalidTransformError, Transform, TransformStamped
-from tfbus.links.carrier import Received, ReceivedMessage, SendReport
-from tfbus.links.outbox import OutgoingBatch, Turn
-from tfbus.links.relay import ReceivedBatch, ReceivedTransform
+from tfbus.links.relay import OutgoingBatch, ReceivedBatch, ReceivedTransform, Turn
+from tfbus.links.seams import Received, ReceivedMessage, SendReport
 from tfbus.tf_message import MalformedMessageError
 
 

@@ -14,7 +14,7 @@ import anyio
 import anyio.abc
 
 from tfbus.links.local.local_wire import LocalWire
-from tfbus.links.wire import Hearing, Joined, Left, WireItem
+from tfbus.links.seams import Hearing, Joined, Left, WireItem
 from tfbus.tf_message import MalformedMessageError
 
 ALL = (Hearing("*", "all"),)

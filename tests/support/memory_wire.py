@@ -6,7 +6,7 @@ from fnmatch import fnmatchcase
 
 import anyio
 
-from tfbus.links.wire import Hearing, Joined, Left, Receive
+from tfbus.links.seams import Hearing, Joined, Left, Receive
 
 
 class MemoryNetwork:
@@ -28,14 +28,6 @@ class MemoryNetwork:
     def go_on(self, link: str) -> None:
         for deliver in self.stopped.pop(link):
             deliver()
-
-    def cut_off(self, *links: str) -> None:
-        """Part some links from all others."""
-        inside, outside = set(links), set(self.wires) - set(links)
-        for one, other in [(one, other) for one in inside for other in outside]:
-            self.cut |= {(one, other), (other, one)}
-            self.wires[one].part(other)
-            self.wires[other].part(one)
 
     def heal(self) -> None:
         self.cut.clear()
@@ -64,7 +56,7 @@ class MemoryNetwork:
 
 
 class MemoryWire:
-    """See `tfbus.links.wire.Wire`."""
+    """See `tfbus.links.seams.Wire`."""
 
     receive: Receive
 
@@ -111,6 +103,9 @@ class MemoryWire:
 
     def is_heard(self, channel: str) -> bool:
         return any(other.channel_of(self.robot) == channel for other in self._others())
+
+    def is_behind(self) -> bool:
+        return False
 
     def publish(self, channel: str, message: bytes) -> None:
         for other in self._others():

@@ -29,7 +29,6 @@ from tfbus import (
     PeerRejected,
     SystemClock,
     Transform,
-    TransformBroadcaster,
     TransformStamped,
     UnknownFrameError,
 )
@@ -155,15 +154,6 @@ class Program:
             await anyio.sleep(max(0.0, due - time.monotonic()))
         return {"longest_call": longest_call, "seconds": time.monotonic() - began}
 
-    async def do_churn(self, frame: str, times: int) -> None:
-        """Publish and remove a static frame many times; at last it exists, at x = `times`."""
-        broadcaster = TransformBroadcaster(self.bus, "churn")
-        for turn in range(times):
-            broadcaster.send_static("map", frame, Transform((float(turn), 0.0, 0.0)))
-            await anyio.lowlevel.checkpoint()
-            self.bus.remove_frame(frame)
-        broadcaster.send_static("map", frame, Transform((float(times), 0.0, 0.0)))
-
     async def do_remove(self, frame: str) -> None:
         # Another process may have been faster.
         with suppress(UnknownFrameError):
@@ -265,6 +255,7 @@ class Program:
             "x": self.x,
             "longest_pause": self.longest_pause,
             "megabytes": pages * 4096 / 1e6,
+            "cpu": time.process_time(),
         }
 
 

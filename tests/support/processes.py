@@ -48,6 +48,32 @@ def new_domain() -> str:
     return f"test-{uuid4().hex}"
 
 
+def free_address() -> str:
+    """An address on the loopback at which no program listens."""
+    return f"tcp/127.0.0.1:{free_ports(1)[0]}"
+
+
+class Place:
+    """A domain of one test: on this machine, or behind the router in the process of its first member."""
+
+    def __init__(self, carrier: str) -> None:
+        self.carrier = carrier
+        self.domain = new_domain()
+        self.address = free_address()
+
+    def first(self, **options: Any) -> dict[str, Any]:
+        return self._link("listen", options)
+
+    def other(self, **options: Any) -> dict[str, Any]:
+        return self._link("connect", options)
+
+    def _link(self, side: str, options: dict[str, Any]) -> dict[str, Any]:
+        if self.carrier == "router":
+            return {"domain": self.domain, side: self.address, **options}
+        options.pop("lease", None)
+        return {"domain": self.domain, **options}
+
+
 class PeerProcess:
     """One such process; its output is kept until a test asks for it."""
 
@@ -219,11 +245,6 @@ def is_open(path: Path) -> bool:
 # Programs as a user runs them, each in a process of its own; a test waits for the lines that they print
 
 TFBUS = str(Path(sys.executable).with_name("tfbus"))
-
-
-def free_address() -> str:
-    """An address on the loopback at which no program listens."""
-    return f"tcp/127.0.0.1:{free_ports(1)[0]}"
 
 
 class Lines:

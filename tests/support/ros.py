@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 from typing import Unpack
 
 from tfbus import Bus, SimulatedClock, TransformStamped
-from tfbus.links.carrier import Presence, Received, SendReport
 from tfbus.links.endpoint import ForeignEnd
 from tfbus.links.ros import RosOptions
 from tfbus.links.ros.ros_link import RosCarrier, RosMessage
 from tfbus.links.ros.settings import settings_of
+from tfbus.links.seams import Presence, Received, SendReport
 from tfbus.tf_message import encode
 
 Said = tuple[bool, list[tuple[str, str, int]]]
@@ -66,6 +66,9 @@ class RosEnd:
 
     def send_soon(self, pending: int) -> None:
         """The test ends the turn."""
+
+    def is_behind(self) -> bool:
+        return False
 
     def stir(self) -> None:
         """Nothing is due."""

@@ -4,7 +4,7 @@ import math
 
 from hypothesis import strategies as st
 
-from tfbus import LATEST, SECOND, Latest, Transform, TransformStamped
+from tfbus import SECOND, Transform, TransformStamped
 from tfbus.rows import Quaternion, Vector
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
@@ -79,11 +79,6 @@ def stamps(low: int = STAMP_MIN, high: int = STAMP_MAX) -> st.SearchStrategy[int
         if near <= far:
             ranges.append(st.integers(near, far))
     return st.one_of(ranges)
-
-
-def data_stamps() -> st.SearchStrategy[int | Latest]:
-    """The stamps that data may carry: an instant or LATEST."""
-    return stamps() | st.just(LATEST)
 
 
 @st.composite

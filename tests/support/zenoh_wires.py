@@ -8,7 +8,7 @@ from typing import Any
 import anyio
 from support.processes import Program, until
 
-from tfbus.links.wire import Hearing, Joined, Left, WireItem
+from tfbus.links.seams import Hearing, Joined, Left, WireItem
 from tfbus.links.zenoh.wire import ZenohWire
 
 LIVE = "live"

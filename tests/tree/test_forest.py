@@ -2,26 +2,22 @@
 
 from collections.abc import Callable
 from functools import partial
-from itertools import count, pairwise, permutations
+from itertools import count, permutations
 from threading import Lock
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.samples import moving, moving_edge, static, static_edge
 
 from tfbus import (
     LATEST,
     DisconnectedError,
-    FutureExtrapolationError,
     Transform,
     TransformStamped,
     TransformTree,
 )
-from tfbus.rows import IDENTITY
-from tfbus.tree.forest import Forest, Path, PathCache, find_path, path_at
+from tfbus.tree.forest import Forest, Path, PathCache, find_path
 from tfbus.tree.history import FrameHistory, save_frame
 from tfbus.tree.tree import forest_of
 
@@ -54,78 +50,7 @@ def test_the_search_climbs_above_the_common_ancestor_no_further_than_the_shorter
     assert len(asked) <= 6
 
 
-NAMES = "abcdef"
-ANY_PARENTS = st.tuples(*(st.sampled_from((NAMES + "g").replace(name, "")) for name in NAMES))
-
-
-@given(ANY_PARENTS, st.sampled_from(NAMES), st.sampled_from(NAMES))
-def test_the_search_ends_for_any_parents_and_finds_a_path_or_names_a_loop(
-    parents: tuple[str, ...], target: str, source: str
-) -> None:
-    parent_of = dict(zip(NAMES, parents, strict=True))
-    try:
-        found = find_path(static_frames(parent_of), target, source, None).frames
-    except DisconnectedError as error:
-        assert not ancestors(parent_of, target) & ancestors(parent_of, source)
-        assert all(parent_of[frame] == parent for frame, parent in pairwise(error.loop))
-        # There is only one root, 'g', so two walks that never meet end in a loop.
-        assert len(error.loop) > 2
-        assert error.loop[0] == error.loop[-1]
-    else:
-        assert (found[0], found[-1]) == (target, source)
-        assert len(set(found)) == len(found)
-        assert all(parent_of.get(a) == b or parent_of.get(b) == a for a, b in pairwise(found))
-
-
-def ancestors(parent_of: dict[str, str], frame: str) -> set[str]:
-    """A frame and all its ancestors."""
-    seen = {frame}
-    while (frame := parent_of.get(frame, frame)) not in seen:
-        seen.add(frame)
-    return seen
-
-
 # The path that counts at a stamp
-
-
-def loop_of(*, a_on_b: tuple[int, ...], b_on_a: tuple[int, ...]) -> Frames:
-    """Frames a and b, each on the other at these stamps, and by the newest stamp, 100, both on c."""
-    a = moving_edge("b", "a", [(at, Transform()) for at in a_on_b])
-    b = moving_edge("a", "b", [(at, Transform()) for at in b_on_a])
-    a.insert("c", 100, IDENTITY, "")
-    b.insert("c", 100, IDENTITY, "")
-    return {"a": a, "b": b}
-
-
-def at_stamp(frames: Frames, target: str, source: str, at: int) -> Path:
-    return path_at(frames, target, source, at, find_path(frames, target, source, None))
-
-
-@pytest.mark.parametrize("at", [0, 5, 10, 99])
-def test_of_two_ways_round_a_loop_the_one_with_samples_counts(at: int) -> None:
-    frames = loop_of(a_on_b=(0, 10), b_on_a=())
-    for target, source in (("a", "b"), ("b", "a")):
-        path = at_stamp(frames, target, source, at)
-        assert path.frames == (target, source)
-        assert [edge.child for edge in path.moving] == ["a"]
-
-
-def test_two_ways_with_samples_are_no_way_unless_one_is_the_newest() -> None:
-    frames = loop_of(a_on_b=(0, 10), b_on_a=(5, 20))
-    assert [edge.child for edge in at_stamp(frames, "a", "b", 4).moving] == ["a"]
-    for target, source in (("a", "b"), ("b", "a")):
-        with pytest.raises(DisconnectedError) as caught:
-            at_stamp(frames, target, source, 7)
-        assert caught.value.stamp == 7
-        assert caught.value.loop in (("a", "b", "a"), ("b", "a", "b"))
-
-
-def test_waiting_helps_if_it_helps_on_one_of_two_ways() -> None:
-    frames: Frames = {"a": moving_edge("b", "a", [(30, Transform())]), "b": moving_edge("a", "b", [(10, Transform())])}
-    for target, source in (("a", "b"), ("b", "a")):
-        error = path_at(frames, target, source, 20, None).deciding_error(20)
-        assert type(error) is FutureExtrapolationError
-        assert (error.child, error.others) in (("b", ()), ("b", ("a",)))
 
 
 def forest(*batch: TransformStamped, window: int | None = None) -> Forest:

@@ -28,28 +28,6 @@ def history(keep: int | None = None, stamps: Iterable[int] = ()) -> FrameHistory
     return made
 
 
-@given(
-    st.lists(st.tuples(st.integers(0, 12), st.sampled_from("pq"), st.sampled_from(["", "sender"])), max_size=40),
-    st.sampled_from([0, 5, 40, None]),
-)
-def test_the_fast_path_for_the_next_sample_equals_an_insertion(
-    steps: list[tuple[int, str, str]], keep: int | None
-) -> None:
-    slow, quick = history(keep), history(keep)
-    stamp = 0
-    for count, (step, parent, authority) in enumerate(steps):
-        stamp += step - 2
-        pose = row(float(count))
-        slow.insert(parent, stamp, pose, authority)
-        quick.append(parent, stamp, pose, authority) or quick.insert(parent, stamp, pose, authority)
-        assert quick.edge() == slow.edge()
-        assert set(quick.named_parents) == set(slow.named_parents)
-        for at in range(stamp - 6, stamp + 1):
-            assert quick.covers(at) == slow.covers(at)
-            if slow.covers(at):
-                assert quick.row_at(at) == slow.row_at(at)
-
-
 @pytest.mark.parametrize("parents", [1, 2])
 @pytest.mark.parametrize("count", [pytest.param(200_000, marks=pytest.mark.thorough), 10_000], ids=["many", "some"])
 def test_samples_take_no_more_memory_than_the_window_and_its_slack_also_after_a_clear(count: int, parents: int) -> None:

@@ -88,67 +88,6 @@ def test_a_history_holds_what_was_inserted_last_at_each_stamp_of_its_window(
     assert edge.newest_record == b"".join(struct.pack("q7d", stamp, *row) for stamp, row in kept[-1:])
 
 
-@on_both
-@pytest.mark.parametrize(("count", "keep"), [(0, 5), (1, 5), (3, None), (40, 5), (200, None)])
-def test_many_samples_are_stored_as_one_after_the_other(kernel: ModuleType, count: int, keep: int | None) -> None:
-    for before in (0, 1, 9):
-        poses = [(10 * k, x(float(k))) for k in range(before + count)]
-        edge, expected = history(kernel, poses[:before], keep), history(kernel, poses, keep)
-        held = edge.columns(0, before)
-        edge.push_many(np.arange(10 * before, 10 * (before + count), 10), np.full((count, 7), IDENTITY))
-        zeros = history(kernel, [(at, row if at < 10 * before else x(0.0)) for at, row in poses], keep)
-        assert contents(edge) == contents(zeros)
-        assert (edge.newest, edge.horizon) == (expected.newest, expected.horizon)
-        assert held[5] == len(poses[:before]) if keep is None else held[5] <= before
-
-
-@on_both
-@pytest.mark.parametrize(
-    ("stamps", "rows"),
-    [
-        ([5], 1),
-        ([4], 1),
-        ([6, 6], 2),
-        ([7, 6], 2),
-        ([6, 2**62, 8], 3),
-        ([STAMP_MAX, STAMP_MIN], 2),
-        ([6, 7], 1),
-        ([6], 2),
-        ([], 1),
-    ],
-)
-def test_many_samples_that_do_not_follow_are_refused_whole(kernel: ModuleType, stamps: list[int], rows: int) -> None:
-    edge = history(kernel, [(4, x(1.0)), (5, x(2.0))])
-    with pytest.raises(ValueError, match=r"newer than all others|row of seven"):
-        edge.push_many(np.array(stamps, np.int64), np.zeros((rows, 7)))
-    assert contents(edge) == [(4, x(1.0)), (5, x(2.0))]
-
-
-@on_both
-def test_the_row_of_a_history_is_that_of_a_chain_of_it_alone(kernel: ModuleType) -> None:
-    edge = history(kernel, [(0, x(1.0)), (10, x(2.0))], keep=10)
-    chain = kernel.Chain((edge,), ())
-    assert [edge.row(at) for at in (-1, 0, 4, 10, 11, 2**70)] == [None, x(1.0), x(1.4), x(2.0), None, None]
-    assert bits(edge.row(3)) == bits(chain.row(3))
-    edge.mixed = True
-    assert edge.row(0) is None
-
-
-@on_both
-def test_the_copy_of_a_history_is_independent(kernel: ModuleType) -> None:
-    edge, twin = history(kernel, [(10, x(1.0)), (20, x(2.0)), (90, x(9.0))], keep=75), history(kernel, keep=75)
-    twin.take(edge)
-    edge.put(0, 20, x(-1.0))
-    edge.push(100, x(10.0))
-    assert contents(twin) == [(20, x(2.0)), (90, x(9.0))]
-    longer = history(kernel, keep=1_000)
-    longer.take(edge)
-    assert [longer.append("parent", stamp, x(1.0), "") for stamp in (100, 101)] == [False, True]
-    twin.take(twin)
-    twin.clear()
-    assert (twin.count, contents(edge)) == (0, [(90, x(9.0)), (100, x(10.0))])
-
-
 @needs_both
 @pytest.mark.skipif(sys.gettrace() is not None, reason="a tracer makes objects that begin a collection")
 def test_a_sample_is_whole_though_the_garbage_collector_clears_the_history_meanwhile() -> None:
@@ -292,42 +231,10 @@ def test_many_rows_are_bit_for_bit_the_single_ones(drawn: Drawn, data: st.DataOb
 
 
 @on_both
-@pytest.mark.parametrize("at", [9, 21, 2**70, -(2**70)])
-def test_there_is_no_row_one_nanosecond_outside_the_samples(kernel: ModuleType, at: int) -> None:
-    path = chain(kernel, [[(10, x(1.0)), (20, x(2.0))], IDENTITY], [[(0, x(1.0)), (30, x(2.0))]])
-    assert path.row(at) is None
-    assert path.row(10) is not None
-    assert path.row(20) is not None
-
-
-@on_both
-def test_there_is_no_row_outside_the_window_nor_in_a_mixed_or_empty_history(kernel: ModuleType) -> None:
-    edge = history(kernel, [(stamp, x(stamp)) for stamp in range(166)], keep=160)
-    path = kernel.Chain((edge,), ())
-    assert (path.row(4), path.row(5)) == (None, x(5.0))
-    # The samples that have left the window are still in memory here.
-    slack = kernel.Chain((history(kernel, [(at, x(at)) for at in (0, 4, 10, 164)], keep=160),), ())
-    assert [slack.row(at) for at in (0, 2, 3, 4, 7, 10)] == [None, None, None, x(4.0), x(7.0), x(10.0)]
-    late = history(kernel, [(0, x(0.0)), (10, x(1.0))], keep=5)
-    assert (kernel.Chain((late,), ()).row(9), kernel.Chain((late,), ()).row(10)) == (None, x(1.0))
-    edge.mixed = True
-    assert path.row(5) is None
-    assert kernel.Chain((history(kernel),), ()).row(0) is None
-
-
-@on_both
 def test_a_chain_of_any_length_has_a_row(kernel: ModuleType) -> None:
     edges: list[Poses | Row] = [[(0, x(0.0)), (2, x(2.0))]] * 300
     assert chain(kernel, edges, edges[:100]).row(1)[0] == 200.0
     assert chain(kernel, [], []).row(5) == IDENTITY
-
-
-@on_both
-def test_the_latest_stamp_is_the_one_that_all_edges_have_reached(kernel: ModuleType) -> None:
-    ahead, behind = [(0, x(0.0)), (9, x(0.0))], [(0, x(0.0)), (5, x(0.0))]
-    assert chain(kernel, [ahead, IDENTITY], [behind]).latest() == 5
-    assert chain(kernel, [ahead, []], [behind]).latest() is None
-    assert chain(kernel, [IDENTITY], []).latest() is None
 
 
 # Plain answers
@@ -398,39 +305,6 @@ def sample(kernel: Any, child: str, stamp: int, metres: float = 0.0, **other: An
     return made
 
 
-@on_both
-def test_a_commit_stores_samples_up_to_the_first_that_is_not_plain(kernel: ModuleType) -> None:
-    frames = {name: history(kernel, [(0, x(0.0))], keep=50) for name in "abc"}
-    batch = (
-        sample(kernel, "a", 10, 1.0),
-        sample(kernel, "b", 10, 2.0),
-        sample(kernel, "a", 60, 3.0),
-        sample(kernel, "c", 10, 4.0, parent="other"),
-        sample(kernel, "b", 20, 5.0),
-        sample(kernel, "new", 20),
-        sample(kernel, "b", 30, static=True),
-    )
-    assert kernel.commit(frames, batch, 0) == 3
-    assert [contents(edge) for edge in frames.values()] == [
-        [(10, x(1.0)), (60, x(3.0))],
-        [(0, x(0.0)), (10, x(2.0))],
-        [(0, x(0.0))],
-    ]
-    assert kernel.commit(frames, batch, 4) == 5
-    assert kernel.commit(frames, batch, 6) == 6
-    assert kernel.commit(frames, batch, 7) == 7
-    assert kernel.commit(frames, (), 0) == 0
-    assert contents(frames["b"])[-1] == (20, x(5.0))
-
-
-@on_both
-def test_a_commit_takes_a_batch_of_any_size(kernel: ModuleType) -> None:
-    frames = {f"f{i}": history(kernel, [(0, x(0.0))]) for i in range(20)}
-    batch = tuple(sample(kernel, f"f{i % 20}", 1 + i, i) for i in range(1_000))
-    assert kernel.commit(frames, batch, 0) == 1_000
-    assert [edge.count for edge in frames.values()] == [51] * 20
-
-
 @needs_both
 @pytest.mark.parametrize("without_lock", [False, True])
 def test_out_of_memory_in_a_commit_leaves_every_history_as_it_was(without_lock: bool) -> None:
@@ -459,29 +333,6 @@ def test_out_of_memory_in_a_commit_leaves_every_history_as_it_was(without_lock: 
 
 def answers_of(kernel: Any, lock: Any) -> Any:
     return kernel.Paths(lock, LATEST, sample_class(kernel))
-
-
-@on_both
-@pytest.mark.parametrize(
-    ("frames", "batch", "readers", "stored"),
-    [
-        ("a", [("a", 1)], {}, True),
-        ("a", [("a", 0)], {}, False),
-        ("a", [("b", 1)], {}, False),
-        ("a", [("a", 1)], {1: set()}, False),
-        ("ab", [("a", 1), ("b", 1), ("a", 1)], {}, False),
-        ("ab", [("a", 1), ("c", 1)], {}, False),
-    ],
-)
-def test_a_batch_is_committed_without_the_lock_if_it_is_plain_as_a_whole(
-    kernel: ModuleType, frames: str, batch: list[tuple[str, int]], readers: dict[int, Any], stored: bool
-) -> None:
-    paths = answers_of(kernel, threading.Lock())
-    histories = {name: history(kernel, [(0, x(0.0))]) for name in frames}
-    samples = tuple(sample(kernel, child, stamp) for child, stamp in batch)
-    assert paths.commit(histories, readers, samples) is stored
-    assert [edge.count for edge in histories.values()] == [1 + stored] * len(frames)
-    assert (paths.inserted, paths.version) == (stored, stored)
 
 
 @needs_both
@@ -608,102 +459,10 @@ def judge(kernel: Any, known_edges: dict[str, Any], batch: Any, horizon: int, sq
     return accepted
 
 
-@on_both
-@pytest.mark.parametrize(("stamp", "plain"), [(11, False), (12, True), (14, True), (15, False)])
-def test_the_bounds_of_stamps_are_inclusive(kernel: Any, stamp: int, plain: bool) -> None:
-    known = known_edges(kernel)
-    known["a"].late = False
-    judge = kernel.Judge(known, 81.0)
-    judge.allow(12, 14, STAMP_MAX)
-    assert (judge.earliest, judge.horizon) == (12, 14)
-    assert judge.accepts((judged_sample(kernel, stamp=stamp),)) is plain
-    assert judge.behind == 0
-
-
-@on_both
-def test_old_stamps_of_a_late_edge_are_plain_and_counted(kernel: Any) -> None:
-    known = known_edges(kernel)
-    known["a"].late = True
-    known["b"].late = False
-    judge = kernel.Judge(known, 81.0)
-    judge.allow(15, 30, STAMP_MAX)
-    late = judged_sample(kernel, stamp=12)
-    assert judge.accepts((late,))
-    assert judge.accepts((late, judged_sample(kernel, stamp=15), judged_sample(kernel, child="b", stamp=15), late))
-    assert not judge.accepts((late, judged_sample(kernel, child="b", stamp=14)))
-    assert judge.behind == 3
-
-
-@on_both
-def test_no_batch_is_plain_once_the_bounds_are_out_of_date(kernel: Any) -> None:
-    judge = kernel.Judge(known_edges(kernel), 81.0)
-    judge.allow(STAMP_MIN, STAMP_MAX, 0)
-    assert not judge.accepts((judged_sample(kernel),))
-    judge.allow(STAMP_MIN, STAMP_MAX, STAMP_MAX)
-    assert judge.accepts((judged_sample(kernel),))
-
-
 def judged_sample(kernel: ModuleType, *, child: str = "a", stamp: int = 20, x: float = 1.0, **other: Any) -> Any:
     """A sample 9 m away if x is 1 m."""
     row = (x, 4.0, 8.0, 0.0, 0.0, 0.0, 1.0)
     return sample(kernel, child, stamp, row=row, **{"parent": "map", "authority": "me", **other})
-
-
-@on_both
-def test_a_batch_that_continues_known_edges_is_plain_and_its_newest_stamps_are_noted(kernel: Any) -> None:
-    known = known_edges(kernel)
-    known["b"].newest = None
-    batch = (
-        judged_sample(kernel),
-        judged_sample(kernel, stamp=15),
-        judged_sample(kernel, child="b", stamp=-5),
-        judged_sample(kernel, stamp=30),
-    )
-    assert judge(kernel, known, batch, 30, 81.0)
-    assert [edge.newest for edge in known.values()] == [30, -5]
-    assert judge(kernel, known, (judged_sample(kernel, stamp=7),), 30, math.inf)
-    assert known["a"].newest == 30
-    assert judge(kernel, known, (), 30, 81.0)
-
-
-@on_both
-@pytest.mark.parametrize(
-    ("changes", "horizon", "square"),
-    [
-        ({"child": "new"}, STAMP_MAX, math.inf),
-        ({"parent": "other"}, STAMP_MAX, math.inf),
-        ({"authority": "you"}, STAMP_MAX, math.inf),
-        ({"static": True}, STAMP_MAX, math.inf),
-        ({"stamp": 41}, 40, math.inf),
-        ({"stamp": STAMP_MIN + 1}, STAMP_MIN, math.inf),
-        ({}, STAMP_MAX, 80.999),
-        ({"x": math.nan}, STAMP_MAX, math.inf),
-        ({"x": math.inf}, STAMP_MAX, 1e24),
-    ],
-)
-def test_one_sample_that_is_not_plain_leaves_every_edge_as_it_was(
-    kernel: Any, changes: dict[str, Any], horizon: int, square: float
-) -> None:
-    known = known_edges(kernel)
-    plain = judged_sample(kernel, child="b", stamp=min(30, horizon))
-    for batch in ((plain, judged_sample(kernel, **changes)), (judged_sample(kernel, **changes), plain)):
-        assert not judge(kernel, known, batch, horizon, square)
-        assert [edge.newest for edge in known.values()] == [10, 10]
-
-
-@on_both
-def test_nobody_is_trusted_with_an_edge_that_trusts_nobody(kernel: Any) -> None:
-    known = known_edges(kernel)
-    known["a"].trusted = None
-    assert known["a"].trusted is None
-    assert not judge(kernel, known, (judged_sample(kernel),), STAMP_MAX, math.inf)
-
-
-@on_both
-def test_a_batch_of_any_size_is_judged(kernel: Any) -> None:
-    known = known_edges(kernel)
-    assert judge(kernel, known, tuple(judged_sample(kernel, stamp=stamp) for stamp in range(500)), STAMP_MAX, 81.0)
-    assert known["a"].newest == 499
 
 
 @needs_both

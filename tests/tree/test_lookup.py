@@ -15,8 +15,6 @@ from tfbus import (
     TransformTree,
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.tree.lookup import Bounds, Extrapolation, Policy, find
-from tfbus.tree.tree import forest_of
 
 # Stamps and names
 
@@ -84,16 +82,6 @@ def test_a_number_or_a_date_of_numpy_is_a_stamp_and_is_returned_as_an_int(at: An
             found = tree.lookup("a", source, at, **question)
             assert type(found.stamp) is int
             assert found.stamp == 5
-
-
-def test_what_is_too_old_for_latest_lacks_what_cannot_be_held() -> None:
-    forest = forest_of(tree_of(*over("map", "base", (5, 10)), moving("base", "arm", 5)))
-    extrapolation = Extrapolation(Policy(hold=3))
-    with pytest.raises(FutureExtrapolationError) as caught:
-        find(forest, "map", "arm", LATEST, Bounds(9, STAMP_MAX), extrapolation)
-    assert (caught.value.child, caught.value.stamp, caught.value.slack) == ("arm", 9, 3)
-    assert caught.value.others == ("base",), "a sample of it may stand in for a missing one"
-    assert find(forest, "map", "arm", LATEST, Bounds(8, STAMP_MAX), extrapolation)[0] == 8
 
 
 def test_the_latest_answer_goes_the_way_that_an_answer_at_its_stamp_goes() -> None:

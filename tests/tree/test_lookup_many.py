@@ -195,24 +195,6 @@ def xs(found: TransformArray) -> list[float]:
     return [float(x) for x in found.translations[:, 0]]
 
 
-@few_and_many
-def test_a_stamp_before_the_window_is_out_of_range(asked: Asked) -> None:
-    # The window's slack, a sixteenth, is ten here: what has left the window is still in memory.
-    tree = tree_of(*over("a", "b", range(166)), keep=160e-9)
-    found = tree.lookup_many("a", "b", asked([4, 5, 165]), out_of_range="nan")
-    assert found.valid[:3].tolist() == [False, True, True]
-
-
-@few_and_many
-def test_an_edge_without_samples_covers_no_stamp(asked: Asked) -> None:
-    tree = tree_of(*over("a", "b", [0, 10]), static("b", "c"))
-    tree.clear()
-    with pytest.raises(FutureExtrapolationError) as caught:
-        tree.lookup_many("a", "c", asked([5]))
-    assert (caught.value.index, caught.value.child, caught.value.newest) == (0, "b", None)
-    assert not tree.lookup_many("a", "c", asked([5]), out_of_range="nan").valid.any()
-
-
 # Time travel
 
 

@@ -125,7 +125,7 @@ def test_the_newest_stamps_are_those_not_after_the_stamp_and_static_frames_have_
 
     def heard(at: int | Latest) -> dict[str, int]:
         poses = reader.read("map", at)
-        return dict(zip(poses.frames, poses.heard.tolist(), strict=True))
+        return dict(zip(poses.frames, poses.newest.tolist(), strict=True))
 
     assert heard(LATEST) == {"map": STAMP_MIN, "base": 30, "lidar": STAMP_MIN}
     assert [heard(at)["base"] for at in (9, 10, 25, 30, 99)] == [STAMP_MIN, 10, 20, 30, 30]

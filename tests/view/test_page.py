@@ -145,19 +145,6 @@ def at(stamp: int) -> Timeline:
     return line
 
 
-def test_a_chosen_stamp_stands_still_until_it_plays_at_its_speed() -> None:
-    line = at(12 * SECOND)
-    line.advance(1.0)
-    assert line.stamp == 12 * SECOND
-    line.play()
-    line.speed = 0.5
-    line.advance(3.0)
-    assert line.stamp == 13_500_000_000
-    line.pause()
-    line.advance(1.0)
-    assert line.stamp == 13_500_000_000
-
-
 def test_a_stamp_outside_of_the_span_becomes_its_nearest_end_and_playing_ends_there_and_begins_anew() -> None:
     assert (at(5 * SECOND).stamp, at(15 * SECOND).stamp, at(30 * SECOND).stamp) == (SPAN[0], 15 * SECOND, SPAN[1])
     line = at(11 * SECOND)

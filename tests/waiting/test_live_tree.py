@@ -4,21 +4,18 @@ from functools import partial
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.samples import live_tree, moving, static, tree_over
 
 from tfbus import (
-    LATEST,
     Edge,
     Question,
     TransformLookupError,
     UnknownFrameError,
 )
-from tfbus.errors import MAY_COME
 from tfbus.tree.forest import LoopingSample
 from tfbus.tree.history import FrameHistory
 from tfbus.waiting.live_tree import LiveTree, Waiter
+from tfbus.waiting.watch_index import WatchState
 
 
 def park(live: LiveTree, target: str, source: str, at: int, woken: list[str]) -> None:
@@ -121,6 +118,23 @@ def test_an_error_of_one_waiter_does_not_keep_others_from_being_woken() -> None:
     assert woken == ["a"]
 
 
+def test_an_error_of_one_watch_does_not_keep_others_from_being_woken() -> None:
+    live = live_tree(None)
+    live.insert((moving("map", "a", 1),))
+    woken: list[str] = []
+
+    def fail() -> None:
+        raise RuntimeError("Event loop is closed")
+
+    for wake in (fail, lambda: woken.append("a")):
+        state = WatchState("map", "a", wake)
+        live.watching.add(state)
+        live.watching.set_answer(state, live.forest, 1)
+        state.outdated = False
+    live.insert((moving("map", "a", 2),))
+    assert woken == ["a"]
+
+
 def test_changing_the_tree_of_a_buffer_directly_is_an_error() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1),))
@@ -168,81 +182,3 @@ def test_an_interrupt_of_one_wake_up_keeps_no_other_from_being_woken() -> None:
         live.insert((moving("map", "a", 5),))
     assert woken == ["a"]
     assert live.waiting.pending() == ()
-
-
-FED_FRAMES = "abc"
-FED_STAMPS = st.integers(0, 12)
-SAMPLES = st.tuples(
-    st.sampled_from(["map", "a", "b"]), st.sampled_from(FED_FRAMES), FED_STAMPS, st.sampled_from([False] * 9 + [True])
-)
-STEPS = st.one_of(
-    st.tuples(st.just("insert"), st.lists(SAMPLES, min_size=1, max_size=4)),
-    st.tuples(
-        st.just("park"), st.sampled_from(["map", *FED_FRAMES]), st.sampled_from(FED_FRAMES), FED_STAMPS | st.none()
-    ),
-    st.tuples(st.just("remove"), st.sampled_from(FED_FRAMES)),
-    st.tuples(st.just("end one"), st.integers(0, 5)),
-)
-
-
-class Play:
-    """A live tree whose plain edges go on by themselves, and what happened to it."""
-
-    def __init__(self, keep: float | None, feeds: bool) -> None:
-        self.live: LiveTree = live_tree(keep)
-        if not feeds:
-            self.live.feed = None
-        self.said: list[object] = []
-        self.waiters: list[Waiter] = []
-
-    def insert(self, drawn: list[tuple[str, str, int, bool]]) -> None:
-        batch = tuple(
-            static(parent, child) if is_static else moving(parent, child, stamp, float(stamp))
-            for parent, child, stamp, is_static in drawn
-            if parent != child
-        )
-        self.live.insert(batch)
-
-    def park(self, target: str, source: str, at: int | None) -> None:
-        stamp: Any = LATEST if at is None else at
-        try:
-            tree_over(self.live).lookup(target, source, stamp)
-        except MAY_COME as error:
-            waiter = Waiter(Question(target, source, stamp), 0, list)
-            waiter.wake = partial(self.note, waiter)
-            self.live.park(waiter, error)
-            self.waiters.append(waiter)
-        except TransformLookupError:
-            return
-
-    def note(self, waiter: Waiter) -> None:
-        answer = waiter.answer
-        found = None if answer is None else (answer.stamp, answer.transform)
-        self.said.append((waiter.question, found, waiter.version == self.live.forest.version))
-
-    def remove(self, frame: str) -> None:
-        self.live.remove_frame(frame)
-
-    def end_one(self, number: int) -> None:
-        if self.waiters:
-            self.live.waiting.remove(self.waiters.pop(number % len(self.waiters)))
-
-
-@given(st.sampled_from([None, 5e-9]), st.lists(STEPS, max_size=40))
-def test_with_and_without_the_feed_the_same_lookups_are_woken_with_the_same_answers(
-    keep: float | None, steps: list[tuple[str, ...]]
-) -> None:
-    plays = [Play(keep, feeds) for feeds in (True, False)]
-    for play in plays:
-        # So most drawn samples continue these edges.
-        play.insert([("map", child, 1, False) for child in FED_FRAMES])
-    for name, *arguments in steps:
-        for play in plays:
-            getattr(play, name.replace(" ", "_"))(*arguments)
-        first, second = (play.live for play in plays)
-        assert plays[0].said == plays[1].said
-        assert list(map(str, first.waiting.pending())) == list(map(str, second.waiting.pending()))
-        assert first.waiting.by_frame.keys() == second.waiting.by_frame.keys()
-        assert first.statistics(0) == second.statistics(0)
-        assert [place[:2] for place in first.waiting.limits] == [place[:2] for place in second.waiting.limits]
-        assert list(first.waiting.names) == list(second.waiting.names) or name != "remove"

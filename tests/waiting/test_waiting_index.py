@@ -3,9 +3,6 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from hypothesis import settings
-from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from tfbus import (
     LATEST,
@@ -18,7 +15,7 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.waiting import live_tree
-from tfbus.waiting.live_tree import Waiter, WaitingIndex, blocking_frames, without_traceback
+from tfbus.waiting.live_tree import Waiter, WaitingIndex, without_traceback
 
 
 def waiter(wake: Callable[[], object] = list) -> Waiter:
@@ -179,80 +176,3 @@ def test_a_waiter_for_which_there_is_no_memory_leaves_nothing_and_disturbs_no_ot
             index.park(waiter(), short_of("tool", 5))
     assert index.pop_unblocked("tool", 9) == [other]
     assert (len(index), index.by_frame) == (0, {})
-
-
-FRAMES = st.sampled_from("abc")
-STAMPS = st.integers(-3, 3)
-ERRORS = st.one_of(
-    st.builds(short_of, FRAMES, STAMPS | st.just(LATEST)),
-    st.builds(unknown, FRAMES),
-    st.permutations("abc").map(lambda names: disconnected(names[0], names[1])),
-)
-
-
-class IndexMachine(RuleBasedStateMachine):
-    """The index compared with a list that is searched linearly."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.index = WaitingIndex()
-        self.model: list[tuple[Waiter, TransformLookupError]] = []
-        self.removed: list[Waiter] = []
-
-    @rule(error=ERRORS)
-    def park(self, error: TransformLookupError) -> None:
-        self.model.append((parked(self.index, error), error))
-
-    @precondition(lambda self: self.removed)
-    @rule(error=ERRORS, data=st.data())
-    def park_again(self, error: TransformLookupError, data: st.DataObject) -> None:
-        again = data.draw(st.sampled_from(self.removed))
-        self.removed.remove(again)
-        self.index.park(again, error)
-        self.model.append((again, error))
-
-    @precondition(lambda self: self.model or self.removed)
-    @rule(data=st.data())
-    def remove(self, data: st.DataObject) -> None:
-        removed = data.draw(st.sampled_from([*(waiting for waiting, _ in self.model), *self.removed]))
-        self.index.remove(removed)
-        self.leave([removed])
-
-    @rule(frame=FRAMES, newest=STAMPS | st.none())
-    def pop_unblocked(self, frame: str, newest: int | None) -> None:
-        for_any: list[Waiter] = []
-        by_stamp: list[tuple[int | float, Waiter]] = []
-        for waiting, error in self.model:
-            if frame not in blocking_frames(error):
-                continue
-            if not isinstance(error, FutureExtrapolationError):
-                for_any.append(waiting)
-                continue
-            needed = float("-inf") if isinstance(error.stamp, Latest) else error.stamp
-            if newest is not None and needed <= newest:
-                by_stamp.append((needed, waiting))
-        expected = for_any + [waiting for _, waiting in sorted(by_stamp, key=lambda place: place[0])]
-        assert self.index.pop_unblocked(frame, newest) == expected
-        self.leave(expected)
-
-    @rule()
-    def pop_all(self) -> None:
-        expected = [waiting for waiting, _ in self.model]
-        assert self.index.pop_all() == expected
-        self.leave(expected)
-
-    def leave(self, waiters: list[Waiter]) -> None:
-        for waiting in waiters:
-            if waiting not in self.removed:
-                self.removed.append(waiting)
-        self.model = [place for place in self.model if place[0] not in waiters]
-
-    @invariant()
-    def nothing_else_is_parked(self) -> None:
-        assert len(self.index) == len(self.model)
-        assert [pending.blocked_by for pending in self.index.pending()] == [error for _, error in self.model]
-        assert set(self.index.by_frame) == {name for _, error in self.model for name in blocking_frames(error)}
-
-
-TestIndexAgainstAList = IndexMachine.TestCase
-TestIndexAgainstAList.settings = settings(deadline=None, stateful_step_count=40)

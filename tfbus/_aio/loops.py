@@ -1,10 +1,10 @@
 """Event loops and threads: waking a loop from any thread, waiting until its tasks are blocked, and joining threads.
 
-How `settling` waits: trio tells when nothing can go on, asyncio does not. `anyio.wait_all_tasks_blocked` looks at every
-task, which costs a program of n timed tasks n steps each time that one of them wakes. But every task and every callback
-that goes on has been given to the public method ``call_soon`` of the loop, and the loop runs them first in, first out.
-So `settling` counts the calls of that method. If nothing has called it between two turns of the task that settles, then
-everything that was given earlier has run, and nothing is left to run.
+How `settling` waits: trio tells when all tasks are blocked, asyncio does not. `anyio.wait_all_tasks_blocked` looks at
+every task, so a program of n timed tasks pays n steps each time that one of them wakes. But asyncio schedules tasks and
+callbacks by the public method ``call_soon`` of the loop, and the loop runs them first in, first out. So `settling`
+counts the calls of that method. If there was no call between two turns of the settling task, then everything that was
+scheduled earlier has run, and nothing is left to run.
 """
 
 import logging
@@ -21,7 +21,7 @@ import anyio.to_thread
 
 
 class LoopWaker:
-    """Calls a function on the event loop soon after any thread has asked for it.
+    """Calls a function on the event loop soon after a thread has asked for it.
 
     Requests that come before the call share one call.
 
@@ -65,7 +65,7 @@ class LoopWaker:
         self._requested = False
 
     def wake(self) -> None:
-        """Have the callback called soon; for any thread.
+        """Request a call of the callback; for any thread.
 
         Raises
         ------
@@ -91,7 +91,7 @@ class LoopWaker:
             # The context of a task: a thread's own does not tell anyio which loop runs, so no task could be started.
             self._context.run(self._callback)
         except Exception:
-            # No task would hear of it, and it would end the whole run of trio.
+            # No task would receive the error, and it would end the whole run of trio.
             logging.getLogger("tfbus").exception("a callback of another thread raised")
 
 
@@ -109,7 +109,7 @@ _MOST_TURNS = 1_000
 
 @contextmanager
 def settling() -> Iterator[Callable[[], Awaitable[None]]]:
-    """A ``with`` that gives an async function which returns when all tasks of the loop are blocked.
+    """A ``with`` that gives an async function; the function returns when all tasks of the loop are blocked.
 
     Tasks that wait for sockets, worker threads or the timers of the loop count as blocked. While a task never blocks,
     the function does not return.
@@ -130,7 +130,7 @@ def settling() -> Iterator[Callable[[], Awaitable[None]]]:
 class _CountedCalls:
     """The method ``call_soon`` of an asyncio loop, with the number of its calls.
 
-    It is in the place of the method while anybody settles. Several that settle on one loop share it.
+    It replaces the method while a task settles. All settling tasks of a loop share it.
     """
 
     def __init__(self, loop: Any) -> None:
@@ -172,14 +172,14 @@ class _CountedCalls:
 
 
 def join_all(threads: Sequence[threading.Thread], seconds: float) -> None:
-    """Wait in this thread for the end of others, but no longer than so many seconds."""
+    """Wait in this thread for the end of other threads, at most for some seconds."""
     deadline = monotonic() + seconds
     for thread in threads:
         thread.join(max(0.0, deadline - monotonic()))
 
 
 async def wait_for_all(threads: Sequence[threading.Thread], seconds: float) -> bool:
-    """Wait for the end of threads, also when cancelled, but no longer than so many seconds.
+    """Wait for the end of threads, also when cancelled, but at most for some seconds.
 
     Returns whether all of them have ended.
     """

@@ -14,8 +14,8 @@ ItemT = TypeVar("ItemT")
 class OneReader(anyio.ResourceGuard):
     """A ``with`` for the one task that reads and waits; a second task gets `anyio.BusyResourceError`.
 
-    Nothing is lost between a look for an item and `wait`: the reader and the code that calls `wake` run in one thread,
-    and the reader does not pass a checkpoint in between.
+    No wake-up is lost between the search for an item and `wait`: the reader and the code that calls `wake` run in one
+    thread, and the reader does not pass a checkpoint in between.
     """
 
     def __init__(self) -> None:
@@ -73,7 +73,7 @@ class OneReaderStream(Generic[ItemT]):
         return self._reader.waiting
 
     def wake(self) -> None:
-        """Have a waiting reader look for the next item again."""
+        """Make a waiting reader look for the next item again."""
         self._reader.wake()
 
     def end(self) -> None:

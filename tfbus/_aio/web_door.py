@@ -1,8 +1,8 @@
 """The door of a web server: the requests that it answers.
 
-A browser connects to servers of its own machine for any page that asks, and tells them by ``Origin`` which page that
-is. A page whose name was made to lead here (DNS rebinding) asks for another ``Host``. Only browsers send ``Origin``: a
-program without it is not held up, for it could send what it likes.
+A browser connects to servers of its own machine for any web page, and names that page in the header ``Origin``. A page
+whose host name was redirected to this machine (DNS rebinding) asks for another ``Host``. Only browsers send
+``Origin``. A program without this header is let in, because a program could send any header.
 """
 
 import ipaddress
@@ -14,9 +14,9 @@ from contextlib import suppress
 from typing import NamedTuple
 
 MAX_HEAD = 16_384
-"""Bytes of the head of a request."""
+"""The greatest length in bytes of the head of a request."""
 HEAD_TIME = 10.0
-"""s, in which the head of a request must come."""
+"""The time in s in which the head of a request must come."""
 HEAD_END = b"\r\n\r\n"
 _ORIGIN = re.compile(r"(https?)://(\[[0-9a-f:.]+\]|[^\s/?#@:\[\]]+)(?::([0-9]{1,5}))?", re.IGNORECASE)
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[^\s/?#@:\[\]]+)(?::([0-9]{1,5}))?", re.IGNORECASE)
@@ -41,7 +41,7 @@ class WebDoor:
         The address that the server listens at.
     origins : iterable of str
         Other pages that may use the server, such as ``https://robot.example:8443``; the server answers to the names
-        of their hosts as well. An application made of web pages has an origin such as ``file://``. ``*`` is for all.
+        of their hosts as well. An application made of web pages has an origin such as ``file://``. ``*`` allows all.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class WebDoor:
     Raises
     ------
     TypeError, ValueError
-        If an origin is no text, or has not the form of one.
+        If an origin is not a text, or is malformed.
     """
 
     def __init__(self, host: str, origins: Iterable[str] = ()) -> None:
@@ -101,7 +101,7 @@ class WebDoor:
     def _judge(self, received: bytes) -> tuple[str, str]:
         headers = _headers(received)
         if headers is None:
-            return "400 Bad Request", "this is no request of HTTP"
+            return "400 Bad Request", "this is not a request of HTTP"
         hosts, origins = headers.get("host", []), headers.get("origin", [])
         if len(hosts) != 1 or len(origins) > 1:
             return "400 Bad Request", "a request has one Host, and no more than one Origin"
@@ -111,7 +111,7 @@ class WebDoor:
         if found is None:
             return "400 Bad Request", f"no host has the name {hosts[0]!a}"
         host = _place(found[1], found[2])
-        # An address leads nowhere else, while the owner of a name can make it lead here.
+        # An address cannot be redirected here, but a name can, by its owner.
         if host.host not in self._names and not _is_address(host.host):
             return "403 Forbidden", f"this server is not {hosts[0]!a}; origins= allows other names"
         if origins and not self._is_own(origins[0], host):
@@ -119,7 +119,7 @@ class WebDoor:
         return "", ""
 
     def _is_own(self, origin: str, host: _Place) -> bool:
-        """Whether a page comes from this server itself, or may use it nevertheless."""
+        """Whether a page comes from this server itself, or `origins` allows it."""
         found = _ORIGIN.fullmatch(origin)
         if found is None:
             return origin.lower() in self._applications
@@ -141,7 +141,7 @@ def _headers(received: bytes) -> dict[str, list[str]] | None:
     found: dict[str, list[str]] = {}
     for line in lines:
         name, colon, value = line.partition(":")
-        # A name with a space, or a line that continues the one before, is read by each server in its own way.
+        # Servers disagree about a name with a space, and about a line that continues the line before.
         if not colon or not re.fullmatch(r"[!#-'*+\-.0-9A-Z^-z|~]+", name) or re.search(r"[\r\n\0]", value):
             return None
         found.setdefault(name.lower(), []).append(value.strip(" \t"))

@@ -1,8 +1,8 @@
-"""The analysis of trees that are complete: a doctor, and the comparison of trajectories.
+"""The analysis of complete trees: their faults, and the comparison of trajectories.
 
-`diagnose` tells what in a tree cannot be right; an `Examiner` is fed with samples as they arrive, and so also sees what
-a tree does not keep, such as duplicates and stamps that go back. `compare` gives the absolute and the relative pose
-error of a frame between two trees, as the benchmarks for SLAM define them. `Arrivals` measures rates and delays.
+`diagnose` lists the faults of a tree. An `Examiner` gets the samples as they arrive, so it also finds faults that a
+tree does not show, such as duplicates and stamps that go back. `compare` gives the absolute and the relative pose error
+of a frame between two trees, as the benchmarks for SLAM define them. `Arrivals` measures rates and delays.
 """
 
 from tfbus.analysis.arrivals import Arrival, Arrivals

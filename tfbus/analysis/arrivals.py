@@ -10,7 +10,7 @@ from tfbus.geometry.stamped import Batch
 from tfbus.stamps import SECOND, from_seconds, time_between
 
 _WEIGHT = 0.1
-"""Of the newest sample in the mean."""
+"""The weight of the newest sample in the mean."""
 
 
 class Delays:
@@ -41,7 +41,7 @@ class Delays:
 
 
 MAX_SAMPLES: Final = 20_000
-"""The number of samples of a frame and sender that are kept; older ones are left out of a window that has more."""
+"""The greatest number of samples that are kept for a frame and sender; older ones are dropped from the window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Arrival:
     Attributes
     ----------
     frame, parent, authority : str
-        The parent is that of the newest sample.
+        The parent is from the newest sample.
     static : bool
         Whether the newest sample is static; such a frame is not measured.
     samples : int
@@ -59,17 +59,17 @@ class Arrival:
     rate : float or None
         Arrivals a second.
     delay_mean, delay_p99, delay_max : float or None
-        Of arrival minus stamp: the mean, what 99 % do not exceed, and the greatest. Negative, if the clock of the
-        sender is ahead.
+        The mean, the 99th percentile and the maximum of arrival minus stamp; negative if the clock of the sender is
+        ahead.
     jitter : float or None
         The standard deviation of the time between two arrivals.
     longest_gap : float or None
         The longest time between two arrivals, or since the last one.
     late : int
-        Samples with an older stamp than one before them.
+        Samples with an older stamp than a sample before them.
     lost : int
-        Samples that are missing between the stamps, if they are to have the median period: an estimate, and for
-        senders with a fixed rate only.
+        Samples that are missing between the stamps, by the median period; an estimate, for senders with a fixed rate
+        only.
     """
 
     frame: str
@@ -88,7 +88,7 @@ class Arrival:
 
 
 class Arrivals:
-    """Measures what arrives, over a window that ends now.
+    """Measures the arriving samples, over a window that ends now.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class Arrivals:
             del self._received[key]
 
     def measure(self, now: int) -> list[Arrival]:
-        """Each frame and sender, sorted by both; one that was silent for the whole window stays, without a rate."""
+        """Each frame and sender, sorted by both; a pair that was silent for the whole window stays, without a rate."""
         found = []
         for (frame, authority), received in sorted(self._received.items()):
             times = received.times

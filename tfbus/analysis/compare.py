@@ -1,4 +1,4 @@
-"""`compare`, which compares the trajectory of a frame in one tree with that in another."""
+"""`compare`, which compares the trajectories of a frame in two trees."""
 
 import math
 from collections.abc import Sequence
@@ -63,7 +63,7 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Statistics of errors, in m or rad; the standard deviation is that of the population."""
+    """Statistics of errors, in m or rad; `std` is the standard deviation of the population."""
 
     rmse: float
     mean: float
@@ -80,7 +80,7 @@ class PoseErrors:
     Parameters
     ----------
     stamps : int64 array of shape (n,)
-        The stamps in the reference, in ns; of a step, that of its end.
+        The stamps in the reference, in ns; for a step, the stamp of its end.
     translation : float64 array of shape (n,)
         m.
     rotation : float64 array of shape (n,)
@@ -157,8 +157,8 @@ def compare(
 ) -> Comparison:
     """Compare where `source` was in `target`, in two trees.
 
-    A trajectory has the stamps of the moving edge between the two frames that has the most samples. Each pose of the
-    shorter one is compared with the pose of the other one that is nearest in time.
+    A trajectory has a pose at each stamp of one moving edge between the two frames: the edge with the most samples.
+    Each pose of the shorter trajectory is compared with the nearest pose in time of the other one.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def compare(
     max_difference : float
         The greatest difference of two stamps, in s.
     delta : int
-        The number of poses from the beginning to the end of a step; each step begins where the one before ends.
+        The number of poses from the beginning to the end of a step; each step begins at the end of the last one.
 
     Returns
     -------
@@ -235,7 +235,7 @@ def _trajectory(tree: TransformTree, target: str, source: str) -> tuple[_Stamps,
 
 
 def _match(first: _Stamps, second: _Stamps, limit: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """The places of the stamps that belong together: of each in the shorter array, the nearest in the other."""
+    """The places of matching stamps: for each stamp of the shorter array, the nearest stamp of the other."""
     if len(second) > len(first):
         return _nearest(first, second, limit)
     places, others = _nearest(second, first, limit)
@@ -249,7 +249,7 @@ def _nearest(short: _Stamps, long: _Stamps, limit: int) -> tuple[npt.NDArray[np.
     if after is None:
         best = np.zeros(len(short), np.intp)
     else:
-        # The earlier one of two that are equally near.
+        # Of two stamps that are equally near, the earlier one.
         nearer = time_between(short, long[after]) < time_between(long[after - 1], short)
         best = np.where(nearer, after, after - 1)
     near = np.flatnonzero(np.abs(time_between(short, long[best])) <= limit)

@@ -1,4 +1,4 @@
-"""`Examiner`, which notes samples as they arrive, and tells what is wrong with them."""
+"""`Examiner`, which notes samples as they arrive, and lists their faults."""
 
 from array import array
 from collections import Counter
@@ -20,9 +20,9 @@ from tfbus.tree.tree import TransformTree, forest_of
 ADVICE = {
     "translation": "no robot is there: look for an uninitialised or diverged estimate at its sender",
     "jump": "the sender has reset, or mixes two estimates: look at it, or leave these out with max_speed=",
-    "turn": "the sender has reset, or two estimates disagree: look at what it does then",
+    "turn": "the sender has reset, or two estimates disagree: look at its state then",
     "stamps go back": "messages overtake each other, or a clock was set back: use one sender, and one clock",
-    "ahead": "the clock of the sender is ahead of that of the recorder: synchronise them",
+    "ahead": "the clock of the sender is ahead of the recorder's clock: synchronise them",
     "duplicate stamps": "the last one wins: give each transform a stamp of its own, or send it once",
     "gap": "lookups interpolate across it: look for what stopped the sender, or refuse with max_gap=",
     "rate": "the sender is overloaded, or messages are lost on the way",
@@ -34,16 +34,16 @@ ADVICE = {
     "never moves": "if it is fixed, send it once as a static transform; if it only stood still, all is well",
     "disconnected": "nothing can be looked up between these trees: a transform is missing",
     "refused": "these are left out",
-    "unfinished": "copy the file again; if its writer was killed, this is what can be read",
+    "unfinished": "copy the file again; if its writer was killed, no more can be read",
 }
 """The advice for each kind of finding."""
 HINTS = frozenset(("never moves",))
-"""The kinds that may be as they are meant."""
+"""The kinds of findings that may be intended."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that is wrong.
+    """A fault that was found.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class Finding:
     unit : str
         ``"m"``, ``"s"``, ``"m/s"``, ``"rad/s"``, ``"Hz"``, or empty.
     detail : str
-        A text that says what happens.
+        The fault in words.
     at : int or None
         The stamp of the worst case, in ns.
     """
@@ -76,7 +76,7 @@ class Finding:
 
     @property
     def is_hint(self) -> bool:
-        """Whether it may be as it is meant, rather than wrong."""
+        """Whether it may be intended, rather than a fault."""
         return self.kind in HINTS
 
     @property
@@ -107,7 +107,7 @@ class Limits:
     ahead : float
         How far a stamp may lie ahead of the time at which it arrives, in s.
     gap : float
-        The shortest time between two stamps that counts as a gap, in s; it must also be ten times the usual one.
+        The shortest time between two stamps that counts as a gap, in s; a gap must also be ten times the usual period.
     norm : float
         How far the norm of a quaternion may be from one.
 
@@ -136,10 +136,10 @@ class Limits:
 _OUTLIER = 20.0
 """The least speed of a jump, as a multiple of the median speed of its frame."""
 _MIN_MOVES = 20
-"""The number of moves from which the median is taken for usual."""
+"""The least number of moves whose median counts as usual."""
 _MIN_STEP = 0.1
 _MIN_TURN = 0.5
-"""m and rad; a smaller one is no jump, unless its speed is beyond the bound."""
+"""In m and rad: a smaller move is no jump, unless its speed is beyond the bound."""
 _WINDOWS = 10
 _MIN_IN_WINDOW = 5
 _GAP = 10.0
@@ -159,7 +159,7 @@ class MovingSamples:
         The number of the parent of each.
     authorities : int array of shape (n,)
     received : int64 array of shape (n,), optional
-        When each arrived, in ns; None if they are in the order of their stamps.
+        The arrival of each, in ns; None if they are in the order of their stamps.
     """
 
     frame: str
@@ -170,7 +170,7 @@ class MovingSamples:
     received: npt.NDArray[np.int64] | None
 
     def findings(self, limits: Limits) -> Iterator[Finding]:
-        """All that is wrong."""
+        """All faults."""
         yield from self._arrivals(limits)
         order = np.argsort(self.stamps, kind="stable")
         stamps, rows, parents = self.stamps[order], self.rows[order], self.parents[order]
@@ -180,10 +180,10 @@ class MovingSamples:
         yield from self._at("translation", far, stamps, lengths, "m", f"farther than {limits.translation:g} m")
         last = np.append(stamps[1:] != stamps[:-1], True)
         yield from self._at("duplicate stamps", ~last, stamps, None, "", "stamps that came before")
-        # Of one stamp, the last sample holds. What is far off anyway is no jump.
+        # If samples share a stamp, the last one holds. A sample that is too far away does not count as a jump as well.
         good = last & ~far
         stamps, rows, parents = stamps[good], rows[good], parents[good]
-        # The difference of stamps that are centuries apart does not fit.
+        # The difference of stamps that are centuries apart does not fit 64 bits.
         if len(stamps) < 2 or int(stamps[-1]) - int(stamps[0]) > STAMP_MAX:
             return
         yield from self._jumps(limits, stamps, rows, parents)
@@ -242,7 +242,7 @@ class MovingSamples:
         counts, edges = np.histogram(stamps - stamps[0], _WINDOWS)
         width = to_seconds(int(stamps[-1] - stamps[0])) / _WINDOWS
         expected = float(np.median(counts))
-        # A window that a pause explains is not told twice.
+        # A window that a pause explains is not reported twice.
         lost = np.zeros(_WINDOWS)
         for start, length in zip(stamps[:-1][pauses], times[pauses], strict=True):
             first = to_seconds(int(start - stamps[0])) / width
@@ -265,7 +265,7 @@ class MovingSamples:
         unit: str,
         detail: str,
     ) -> Iterator[Finding]:
-        """The finding for the samples that are wrong, if there are any."""
+        """The finding for the faulty samples, if there are any."""
         places = np.flatnonzero(wrong)
         if not len(places):
             return
@@ -279,7 +279,7 @@ class MovingSamples:
 
 _SHOWN = 5
 _MANY = 10
-"""Fewer samples in one place do not tell that a frame never moves."""
+"""The least number of samples in one place that prove that a frame never moves."""
 
 
 class Examiner:
@@ -303,7 +303,7 @@ class Examiner:
         ----------
         batch : iterable of TransformStamped
         received : int, optional
-            When they arrived, in ns. Without it, they count as being in the order of their stamps.
+            The time of their arrival, in ns. Without it, they are taken to arrive in the order of their stamps.
         """
         for sample in batch:
             frame = self._frames.get(sample.child)
@@ -316,14 +316,14 @@ class Examiner:
         self._refused.update(reasons)
 
     def add_norm(self, frame: str, stamp: int, norm: float) -> None:
-        """Note the norm of a quaternion as it was sent, before it was normalised."""
+        """Note the norm that a quaternion had before it was normalised."""
         off = abs(norm - 1.0)
         if off > self._limits.norm:
             count, first, worst = self._uneven.get(frame, (0, stamp, 0.0))
             self._uneven[frame] = count + 1, first, max(worst, off)
 
     def findings(self) -> list[Finding]:
-        """All that is wrong: first that of the whole tree, then by frame."""
+        """All faults: first the faults of the whole tree, then the faults of each frame."""
         found = list(self._of_the_tree())
         for name in sorted(self._frames):
             found += self._frames[name].findings(self._limits)
@@ -384,7 +384,7 @@ class _Frame:
             self._newest, self.parent = stamp, parent
 
     def findings(self, limits: Limits) -> Iterator[Finding]:
-        """All that is wrong with this frame."""
+        """All faults of this frame."""
         yield from self._of_senders()
         if self._static is not None:
             x, y, z = self._static[1][:3]
@@ -441,7 +441,7 @@ def _number(numbers: dict[str, int], name: str) -> int:
 
 
 def diagnose(tree: TransformTree, limits: Limits | None = None) -> list[Finding]:
-    """Examine a tree: translations and speeds that cannot be, gaps, rates that break down, senders that disagree.
+    """Examine a tree: impossible translations and speeds, gaps, rates that break down, senders that disagree.
 
     A tree keeps the samples of a frame in the order of their stamps, one for each stamp, and its last static value. So
     duplicates, changes of statics and stamps that go back are found only while samples arrive: see
@@ -474,7 +474,7 @@ class _Seen(NamedTuple):
 
     @classmethod
     def of(cls, history: FrameHistory) -> "_Seen":
-        """The samples as they are now; nothing is copied that numpy can copy later."""
+        """The present samples; numpy copies most of them later, without the lock."""
         edge, static = history.edge(), None
         if edge.static and history.static_stamp is not None:
             row = history.static_row

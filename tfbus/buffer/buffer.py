@@ -36,24 +36,24 @@ class Buffer:
     Parameters
     ----------
     bus : Bus
-        It fills the buffer from now on, first with the latched samples, and holds it until `close`. A late sample that
-        names another parent than a newer one from before the buffer joined is left out, and counted as `superseded`:
-        it would be taken for the newest.
+        It fills the buffer from now on, first with the latched samples, and holds it until `close`. If the bus has had
+        a newer sample of a frame with another parent before the buffer joined, a late sample of that frame is left out
+        and counted as `superseded`: the buffer would take it for the newest.
     keep : float or None
         Length of the history of each frame, in s before that frame's newest stamp; None keeps everything. A late
         sample then costs more the longer the history is, because all samples after it are moved: in the middle of a
         million samples some ms.
     prefix : str, optional
-        Put before the names of this buffer's frames on the bus, such as ``"robot1/"``, so that several robots with the
-        same frames can share a bus. All methods take and give names without it.
+        The prefix of this buffer's frames on the bus, such as ``"robot1/"``, so that several robots with the same
+        frames can share a bus. All methods take and give names without it.
     shared : iterable of str
         Names without a prefix, because they are the same for all robots, such as ``{"map"}``.
     prefill : Buffer or TransformTree, optional
-        Start with a copy of its history, as far as `keep` reaches. With a buffer of the same bus, this one then answers
-        as if it had been there from the beginning. Otherwise the latched samples of this bus are added, and the stamps
-        of both must be of the same time: a sample older than its window expires. A closed buffer still has the frames
-        that were removed after it was closed. Where the prefill contradicts the bus, the bus is right: a frame with
-        another newest parent, or one that would close a loop with newest edges of the bus, is left out or removed.
+        Start with a copy of its history, as far as `keep` reaches. With a buffer of the same bus, the new buffer
+        answers as if it had been there from the beginning. Otherwise the latched samples of this bus are added, and
+        both must have stamps of the same clock: a sample older than its window expires. A closed buffer still has the
+        frames that were removed after it was closed. Where the prefill contradicts the bus, the bus is right: a frame
+        with another newest parent, or with an edge that would close a loop on the bus, is left out or removed.
 
     Raises
     ------
@@ -139,8 +139,8 @@ class Buffer:
         at : int or LATEST
             ns.
         max_age : float, optional
-            Count a `LATEST` answer older than this many s as not yet arrived, and refuse one that is further ahead of
-            the clock.
+            Count a `LATEST` answer older than this many s as not yet arrived, and refuse an answer that is further than
+            this ahead of the clock.
         source_at, fixed, tolerance, max_gap, extrapolate
             As `TransformTree.lookup`.
 
@@ -200,8 +200,8 @@ class Buffer:
         timeout : float, optional
             In s on the bus's clock; None waits for ever.
         max_age : float, optional
-            Count a `LATEST` answer older than this many s as not yet arrived, so that a dead broadcaster cannot
-            answer for ever; and refuse one that is further ahead of the clock, which would answer as long.
+            Count a `LATEST` answer older than this many s as not yet arrived, so that the last sample of a dead
+            broadcaster does not answer for ever. Refuse an answer that is further than this ahead of the clock.
         source_at : int or LATEST, optional
             Take source at this stamp instead, and carry it to `at` through `fixed`.
         fixed : str, optional
@@ -229,7 +229,7 @@ class Buffer:
         ClockResetError
             If the clock jumped back meanwhile.
         UnknownFrameError
-            At once, if a name cannot be that of a frame: empty, or with a leading slash.
+            At once, if a name cannot be the name of a frame: empty, or with a leading slash.
         TypeError
             If a stamp is a float, or `max_age` comes without a `LATEST`.
         """
@@ -238,7 +238,7 @@ class Buffer:
         return await self._lookups.lookup(self._on_bus(question), timeout)
 
     async def _lookup_among(self, questions: Sequence[Question]) -> None:
-        """Wait until each question has had an answer; an error of any that waiting cannot help is raised at once.
+        """Wait until each question has had an answer; if waiting cannot help one of them, raise its error at once.
 
         Called by message filters.
         """
@@ -259,14 +259,14 @@ class Buffer:
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
     ) -> DataT:
-        """`data` in the frame `target`, by the transform of their own stamp, as soon as that has arrived.
+        """`data` in the frame `target`, by the transform at their own stamp, as soon as it is known.
 
         Parameters
         ----------
         data : any type of `tfbus.data` but LaserScan, or a type registered with `do_transform`
             With `frame` and `stamp`; the stamp may be `LATEST`.
         target : str
-            Data that are in it already, while the buffer does not know it, stay as they are.
+            Data that are in this frame already stay as they are, even if the buffer does not know the frame.
         timeout, max_age : float, optional
             As `lookup`.
         at : int or LATEST, optional
@@ -274,12 +274,13 @@ class Buffer:
         fixed : str, optional
             The frame that stands still between the two stamps.
         tolerance, max_gap, extrapolate
-            As `lookup`. The data do not say what was done; where that matters, look the transform up.
+            As `lookup`. The result does not say whether samples were held or extrapolated; if that matters, look the
+            transform up.
 
         Returns
         -------
         same type as `data`
-            Its frame is `target`, its stamp that of the transform.
+            Its frame is `target`, and its stamp is the stamp of the transform.
 
         Raises
         ------
@@ -331,7 +332,7 @@ class Buffer:
         target, source, at, question
             As `lookup`.
         timeout : float or None
-            In s, on the bus's clock; None to wait as long as it takes.
+            In s, on the bus's clock; None waits for ever.
 
         Returns
         -------
@@ -372,21 +373,22 @@ class Buffer:
     ) -> Watch:
         """The answer at `LATEST` whenever it has changed: ``with buffer.watch(...) as w: async for transform in w``.
 
-        It starts with the present answer and then compares with the last one that it gave. A slow reader gets the
-        newest answer when it reads, and an insertion elsewhere in the tree wakes no watch. While there is no answer it
-        waits as `lookup` does, and goes on with the next answer. It raises none of the errors of `lookup`: at `LATEST`
-        no stamp is too old or in a gap for good; the watch waits for the lagging edge.
+        It starts with the present answer, and compares each later one with the last answer that it gave. A slow reader
+        gets the newest answer when it reads. An insertion elsewhere in the tree wakes no watch. While there is no
+        answer, the watch waits as `lookup` does. It raises none of the errors of `lookup`: at `LATEST` no stamp is too
+        old or in a gap for good, so the watch waits for the lagging edge.
 
         Parameters
         ----------
         target, source : str
         min_translation : float
-            Give an answer when source has moved by so many m.
+            In m. Give an answer when source has moved by this much.
         min_rotation : float
-            Give an answer when it has turned by so many rad. With both, either will do; without any, every answer with
-            another stamp or value is given.
+            In rad. Give an answer when source has turned by this much. With both thresholds, one is enough; without
+            any, the watch gives every answer with another stamp or value.
         max_rate : float, optional
-            Give no more than this many answers per s on the bus's clock. Only the last, after the end, may come sooner.
+            Give at most this many answers per s on the bus's clock. Only the last answer, after the end, may come
+            sooner.
         max_age : float, optional
             Ignore answers that are older than this many s, or further ahead of the clock. An answer that was given is
             not withdrawn when it gets old.
@@ -402,7 +404,7 @@ class Buffer:
         Raises
         ------
         UnknownFrameError
-            If a name cannot be that of a frame: empty, or with a leading slash.
+            If a name cannot be the name of a frame: empty, or with a leading slash.
         TypeError, ValueError
             If a threshold is negative or an angle of more than pi, a rate is not greater than zero, or something is not
             a number.

@@ -5,9 +5,10 @@
 unblocks the lookup hands over the answer. The task gives that answer if the tree has not changed until it runs, one
 turn of the event loop later; otherwise it asks again, and may park again on the same deadline.
 
-The end of a wait is an alarm. A cancel scope for each wait would set and remove a timer of the event loop each time;
-the alarms of a buffer share one timer. It is set for the first alarm, and stays as it is when that alarm is cancelled,
-because the next one is nearly always later. A lookup that has waited for 5 s is logged, with all others that have.
+An alarm ends a wait at its timeout. A cancel scope for each wait would set and remove a timer of the event loop each
+time; the alarms of a buffer share one timer. The timer is set for the first alarm. When that alarm is cancelled, the
+timer stays, because the next alarm is nearly always later. A lookup that has waited for 5 s is logged, together with
+all others that have.
 """
 
 import logging
@@ -47,7 +48,7 @@ from tfbus.waiting.live_tree import LiveTree, PendingLookup, Waiter, WaitingInde
 
 
 def running_loop() -> Any:
-    """The event loop that runs here: that of asyncio, or the token of trio."""
+    """The running event loop: the loop object of asyncio, or the token of trio."""
     # anyio has no public timer; only the loops' own functions set one without a task of the caller.
     return cast(Any, anyio.lowlevel.current_token().native_token)
 
@@ -76,11 +77,11 @@ class LoopTimer:
         self._handle: Any = None
 
     def now(self) -> float:
-        """The time of the loop, in s. Only the loop that runs has one."""
+        """The time of the loop, in s, while the loop runs."""
         return float(self.loop.time() if self._trio is None else self._trio.current_time())
 
     def set(self, due: float) -> None:
-        """Call the function at a time, in s, and not at the one that was set before."""
+        """Call the function at a time, in s; a time that was set before no longer counts."""
         self.due = due
         if self._trio is None:
             if self._handle is not None:
@@ -98,7 +99,7 @@ class LoopTimer:
         try:
             self._callback()
         except Exception:
-            # No task would hear of it, and it would end the whole run of trio.
+            # No task would receive the error, and it would end the whole run of trio.
             logging.getLogger("tfbus").exception("a timer raised")
 
     async def _sleep(self, scope: Any) -> None:
@@ -226,7 +227,7 @@ class Alarms(Protocol):
 
 
 def alarms_of(clock: Clock) -> Alarms | None:
-    """Alarms by the clock of a bus; None for a clock of which only the protocol is known."""
+    """Alarms by the clock of a bus; None for a clock that is not a class of tfbus."""
     # Not isinstance: a class derived from a clock may tell the time in another way.
     if type(clock) is SystemClock:
         return LoopAlarms()
@@ -301,7 +302,7 @@ class AlarmHeap:
 
 
 REPORT_AFTER = 5.0
-"""A lookup that has waited for longer than this, in s, is logged."""
+"""A lookup that has waited for this long, in s, is logged."""
 
 NAMED = 3
 """The number of lookups that a line names; naming one searches all frames for similar names."""
@@ -330,7 +331,7 @@ class HangingReport:
         Returns
         -------
         float
-            The time, in s, until this is to be called again; infinity if the cause has been told.
+            The time, in s, until the next call of this method; infinity if the cause has been logged.
         """
         if _cause(blocker) in self._told:
             return math.inf
@@ -421,7 +422,7 @@ class Lookups:
     ----------
     live : LiveTree
     bus : Bus
-        Its clock is that of timeouts and ages; it says which thread may wait here.
+        Its clock measures timeouts and ages; it says which thread may wait here.
     local_names : LocalNames, optional
         Translates the answers. Questions, errors and log lines have the names of the bus.
     """
@@ -482,9 +483,9 @@ class Lookups:
     async def lookup(
         self, question: Question, timeout: float | None, others: tuple[Question, ...] = ()
     ) -> TransformStamped:
-        """The answer as soon as there is one, after a checkpoint; the errors are those of `Buffer.lookup`.
+        """The answer as soon as there is one, after a checkpoint; the errors are as in `Buffer.lookup`.
 
-        `others` are questions whose answers are needed as well: an error of one that waiting cannot help is raised.
+        `others` are further questions that need an answer: if waiting cannot help one of them, its error is raised.
         """
         limit = math.inf if timeout is None else as_duration(timeout, "timeout")
         last_reset = self.live.last_reset
@@ -503,7 +504,7 @@ class Lookups:
             if found is not None:
                 return found
             raise _timed_out(wait, limit) from wait.blocker
-        # Here and not in a coroutine of its own, because each would be resumed one by one.
+        # Inline, because every further coroutine would be resumed one by one.
         self._set_alarms(wait, limit, alarms)
         waiting, paths = self.live.waiting, self.live.forest.paths
         try:
@@ -517,7 +518,7 @@ class Lookups:
                     raise
                 found = waiter.answer
                 if found is not None and waiter.version == paths.version:
-                    # As it was when the waiter was woken, and removed.
+                    # Nothing has changed since the insertion woke and removed the waiter.
                     return found if self._local_names is None else self._local_names.answer(found)
                 waiting.remove(waiter)
                 found = self._ask_again(wait)
@@ -547,7 +548,7 @@ class Lookups:
             wait.cancel_reminder = alarms.call_after(REPORT_AFTER, partial(self._remind, wait, alarms))
 
     def _park(self, wait: "_Wait") -> Waiter:
-        """Park a lookup under what it lacks, with a new wake-up."""
+        """Park a lookup under the frames that block it, with a new wake-up."""
         live = self.live
         if live.end_reason is not None:
             raise BusClosedError(live.end_reason) from wait.blocker
@@ -557,9 +558,9 @@ class Lookups:
         return waiter
 
     def _ask_again(self, wait: "_Wait") -> TransformStamped | None:
-        """The answer, or None; then the error that blocks it is noted."""
+        """The answer; or None, after noting the error that blocks it."""
         try:
-            # The data may have come in the same turn of the loop in which the time was up.
+            # The data may have come in the turn of the loop in which the time ran out.
             return self._lookup_since(wait.last_reset, wait.question)
         except MAY_COME as error:
             wait.blocker = without_traceback(error)
@@ -604,7 +605,7 @@ class Lookups:
         return self.lookup_nowait(question)
 
     def _check_names(self, question: Question) -> None:
-        """Raise `UnknownFrameError` for a name that can never be that of a frame."""
+        """Raise `UnknownFrameError` for a name that can never be the name of a frame."""
         for name in (question.target, question.source, question.fixed):
             if name is not None and not is_frame(name):
                 raise UnknownFrameError(frame=name, known=self.live.forest.some_frames()) from None

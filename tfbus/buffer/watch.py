@@ -28,7 +28,7 @@ class Watch:
     Attributes
     ----------
     skipped : int
-        Number of batches that touched the watched path and that no answer shows, because a later batch had come.
+        Number of batches that touched the watched path but appear in no answer, because a later batch had come.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class Watch:
         return answer
 
     def _is_change(self, answer: TransformStamped) -> bool:
-        """Whether an answer differs enough from the last one that was yielded."""
+        """Whether an answer differs enough from the last one."""
         last = self._last
         if last is None:
             return True

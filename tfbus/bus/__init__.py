@@ -1,4 +1,4 @@
-"""The bus: what is published reaches every buffer, stream and subscriber of the process."""
+"""The bus: a published sample reaches every buffer, stream and subscriber of the process."""
 
 from tfbus.bus.broadcaster import TransformBroadcaster
 from tfbus.bus.bus import Bus, ThreadPublisher

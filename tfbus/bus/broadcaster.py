@@ -21,14 +21,14 @@ class TransformBroadcaster:
     authority : str
         The name of the sender, which errors and tools show.
     prefix : str, optional
-        Put before the names of this broadcaster's frames on the bus, such as ``"robot1/"``, so that several robots
-        with the same frames can share a bus. The methods take names without it.
+        The prefix of this broadcaster's frames on the bus, such as ``"robot1/"``, so that several robots with the same
+        frames can share a bus. The methods take names without it.
     shared : iterable of str
         Names without a prefix, because they are the same for all robots, such as ``{"map"}``.
     invalid : {"raise", "drop"}
-        The fate of a sample that the bus refuses, as in `Bus.publish`. ``"drop"`` is for a program that must go on
-        whatever edges others publish: the sample is left out, counted, and logged once. A bad name, stamp or transform
-        is an error all the same.
+        The fate of a sample that the bus refuses, as in `Bus.publish`. ``"drop"`` is for a program that must survive
+        contradicting edges of others: the sample is left out, counted, and logged once. A bad name, stamp or transform
+        still raises an error.
 
     Raises
     ------
@@ -88,14 +88,14 @@ class TransformBroadcaster:
     def send_all(
         self, samples: Iterable[TransformStamped | tuple[str, str, Transform]], at: StampLike | None = None
     ) -> None:
-        """Publish several at once; they are seen all or not at all.
+        """Publish several samples as one batch: readers see all of them or none.
 
         Parameters
         ----------
         samples : iterable of (parent, child, transform) or TransformStamped
-            The former are stamped with `at`; the latter keep their stamp and get this authority.
+            Tuples get the stamp `at`; samples keep their stamp, and get this authority.
         at : int, optional
-            ns; by default the clock's now, one for all.
+            ns; by default the clock's now, the same for all.
 
         Raises
         ------
@@ -122,7 +122,7 @@ class TransformBroadcaster:
     def owning(self, *frames: str) -> Iterator[None]:
         """Own frames inside a ``with``: no other authority may publish them, and at its end they are removed.
 
-        No edge of somebody else can keep them from the place that this broadcaster gives them: see `Bus.reserve`.
+        No edge of another authority can displace them: see `Bus.reserve`.
 
         The end removes all samples of a frame, also older ones, whichever authority sent them. It skips a frame that
         was never published. Once the bus is closed, nothing is removed.

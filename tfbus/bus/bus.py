@@ -38,11 +38,11 @@ from tfbus.which_kernel import Intake
 
 
 class OwnerThread:
-    """The thread that may use a bus: first the one that made it, then that of the first event loop that uses it.
+    """The thread that may use a bus: its maker's thread, until the first event loop that uses the bus takes it over.
 
-    `fork` copies the thread that calls it, and no other. A child has a copy of a bus, but neither the event loop nor
-    the threads of the links, recorders and servers on it: a sample that it published would reach nobody. So such a bus
-    belongs to no thread of the child. A bus without any of these is a plain object, and the child may use its copy.
+    `fork` copies only the thread that calls it. The child has a copy of the bus, but neither the event loop nor the
+    threads of the links, recorders and servers on it, so its samples would reach nobody. Such a bus belongs to no
+    thread of the child. A bus without links, recorders and servers is a plain object, and the child may use its copy.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class OwnerThread:
     thread : int
         Its identity, as `threading.get_ident` gives it; 0 for none.
     entered : WeakSet
-        The links, recorders and the like that were entered on the bus and work in threads or on the loop of this
+        The links, recorders and servers that were entered on the bus. They work in threads or on the loop of this
         process.
     """
 
@@ -82,7 +82,7 @@ class OwnerThread:
         self._on_a_loop = on_a_loop
 
     def check_process(self) -> None:
-        """Raise `RuntimeError` in a child of `fork`, which has the bus without the links and threads on it."""
+        """Raise `RuntimeError` in a child of `fork` whose copy of the bus lacks links or threads."""
         if self._left_behind:
             raise RuntimeError(
                 f"this process was forked, and fork has not copied what works for the bus, {self._left_behind}: "
@@ -90,7 +90,7 @@ class OwnerThread:
             )
 
     def leave_behind(self) -> None:
-        """Belong to no thread of this process, which was forked, if anything was entered on the bus."""
+        """In a child of `fork`: give the bus to no thread if a link or the like was entered on it."""
         if self.entered:
             self._left_behind = " and ".join(sorted({type(thing).__name__ for thing in self.entered}))
             self._set(0)
@@ -133,38 +133,38 @@ class Bus:
         The source of stamps, and the clock of timeouts and timed tasks; by default a `SystemClock`.
     on_conflict : {"last", "reject"}
         The fate of samples of a child that another authority has published before: the bus accepts and reports them, or
-        refuses them until the frame is removed, across jumps of the clock. The empty authority ``""`` is one like any
+        refuses them until the frame is removed, across jumps of the clock. The empty authority ``""`` counts like any
         other.
     max_translation : float
         The greatest magnitude of a translation, in m, at most 1e100; a longer one is refused as not physical.
     max_ahead : float or None
-        How far, in s, the stamp of a moving sample may be ahead of the clock. One that is further ahead is announced as
-        `StampAhead`, logged once for each authority and frame, and counted. None for any distance: for a bus that
-        carries recorded time. A `Player` needs no None, and a `SimulatedClock` that nobody has set yet (at 0, without a
-        jump) has no stamp ahead of it.
+        How far, in s, the stamp of a moving sample may be ahead of the clock. A sample further ahead is announced as
+        `StampAhead`, logged once for each authority and frame, and counted. None, for any distance, suits a bus with
+        recorded stamps; a `Player` does not need it. No stamp is ahead of a `SimulatedClock` that nobody has set yet
+        (at 0, without a jump).
     max_behind : float or None
-        How far, in s, the stamp of a moving sample may be behind the clock. One that is further behind is accepted, but
-        announced as `StampBehind`, logged once for each authority and frame, and counted; so is one that expires in a
-        buffer. None for any distance, and for no word of what expires.
+        How far, in s, the stamp of a moving sample may be behind the clock. A sample further behind is accepted, but
+        announced as `StampBehind`, logged once for each authority and frame, and counted; so is a sample that expires
+        in a buffer. None, for any distance, also keeps expired samples from being reported.
     reject_ahead : bool
-        Whether a sample that is further ahead is refused. Otherwise it is accepted; until the clock has reached it,
-        right samples of its frame are older than the newest, and expire if they are older than a buffer's window.
+        Whether a sample that is further ahead is refused. Otherwise it is accepted. Until the clock has reached its
+        stamp, correct samples of its frame are older, and expire if they are older than a buffer's window.
     max_frames : int or None
         The greatest number of frames, children and parents of the newest edges, for a bus on which strangers publish. A
-        sample that names a new one beyond it is refused. A frame that is removed gives its place back, and so does a
+        sample that would add a frame beyond this number is refused. A removed frame frees its place, and so does a
         parent without children. None for any number.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is none of these, or `reject_ahead` comes without a `max_ahead`.
+        If an argument has another type or value, or `reject_ahead` comes without a `max_ahead`.
 
     Notes
     -----
-    A bus may be made before an event loop runs. It belongs to the thread that made it, until an event loop in another
-    thread uses it first; a loop has a claim on it once it has awaited a lookup, read a stream or entered `threadsafe`.
-    Other threads publish through `threadsafe`. A child made by ``fork`` may use its copy of a bus only if no link,
-    recorder, view, server or `threadsafe` was entered on it: they work in the parent.
+    You can make a bus before an event loop runs. It belongs to the thread that made it, until the first event loop that
+    awaits a lookup, reads a stream or enters `threadsafe` takes it over. Other threads publish through `threadsafe`. A
+    child made by ``fork`` may use its copy of a bus only if no link, recorder, view, server or `threadsafe` was entered
+    on it, because these work in the parent.
 
     Examples
     --------
@@ -238,7 +238,7 @@ class Bus:
         return self._topology.max_frames
 
     def publish(self, samples: TransformStamped | Iterable[TransformStamped], invalid: Invalid = "raise") -> None:
-        """Send one sample, or a batch that is seen all or not at all.
+        """Send one sample, or a batch: readers see all of a batch or nothing.
 
         When this returns, every buffer has the samples and the lookups that waited for them have been woken.
 
@@ -248,7 +248,7 @@ class Bus:
         invalid : {"raise", "drop"}
             The fate of a sample that the bus refuses: raise an error and store nothing of the batch; or leave that
             sample out, count it, and log it once for each reason, frame and authority. ``"drop"`` is for programs that
-            pass on the samples of others, and for programs that the edges of others must not end.
+            pass on the samples of others, or must survive contradicting edges of others.
 
         Raises
         ------
@@ -266,7 +266,7 @@ class Bus:
             If this is not the bus's thread, or this process was forked and has the bus without its links; if
             subscribers that publish have queued more than 1,000 batches.
         """
-        # Nearly always samples only continue known edges, and the buffers are all that hears of them.
+        # The usual case: samples only continue known edges, and nobody but the buffers gets them.
         taken = self._take(samples, invalid)
         if taken:
             return
@@ -310,9 +310,9 @@ class Bus:
     def subscribe(self, callback: BatchCallback, removed: FrameCallback | None = None) -> Registration:
         """Call `callback` with each batch, a tuple of samples, until the registration is closed.
 
-        It is called inside `publish`, so it should be quick; if it publishes, those batches are delivered behind the
-        current one. If it raises an `Exception`, that is logged once and counted, and no other subscriber is affected.
-        It is called with the latched samples at once.
+        `publish` calls it, so it should be quick; batches that it publishes are delivered after the current one. If it
+        raises an `Exception`, that is logged once and counted, and no other subscriber is affected. The latched samples
+        are delivered at once.
 
         `removed` is called with each frame that `remove_frame` removes, between the batches before and after it.
 
@@ -329,9 +329,9 @@ class Bus:
         Parameters
         ----------
         capacity : int
-            How many moving samples may wait for the reader; with ``"conflate"`` that is a number of children.
+            How many moving samples may wait for the reader; with ``"conflate"``, of how many children.
         overflow : {"conflate", "drop_oldest"}
-            Keep the newest sample a child, or the newest whole batches. Static samples are never dropped.
+            Keep the newest sample of each child, or the newest whole batches. Static samples are never dropped.
 
         Raises
         ------
@@ -360,7 +360,7 @@ class Bus:
             at the beginning, and of stale and live frames, are never dropped.
         stale_after : float or None
             A moving frame is stale when its newest stamp is more than this many s behind the clock, and live again when
-            it is not; None for no such events. It is found while a task reads, without a timer of its own.
+            it is not; None for no such events. The stream checks this while a task reads, without a timer of its own.
 
         Raises
         ------
@@ -374,7 +374,7 @@ class Bus:
         return events
 
     def _announce(self, event: Event) -> None:
-        """Announce an event that the bus cannot know. Called by links and recorders."""
+        """Announce an event from outside of the bus. Called by links and recorders."""
         self._check_thread()
         self._announcer.announce(event)
 
@@ -397,14 +397,14 @@ class Bus:
         Earlier samples of another authority stay; later ones are refused with ``reason="reserved"``. One authority may
         reserve a frame several times.
 
-        No edge of somebody else can keep the frame from the place that `authority` gives it. An edge that would hang an
-        ancestor of the frame below it is refused. If such an edge was there before the frame had its parent, it is
-        removed, with its frame, when `authority` publishes; an edge of a frame that its own sender has reserved stays.
+        No edge of another authority can displace the frame. An edge that would put an ancestor of the frame below it is
+        refused. If such an edge was there before the frame had its parent, the bus removes its child when `authority`
+        publishes, unless the sender of that edge has reserved this child.
 
         Raises
         ------
         InvalidTransformError
-            If another authority has reserved it, or the name cannot be that of a frame.
+            If another authority has reserved it, or the name cannot be the name of a frame.
         BusClosedError
         """
         self._check_usable()
@@ -556,7 +556,7 @@ class Bus:
             self._events.remove(events)
 
     def _insert(self, batch: Batch) -> BaseException | None:
-        """Insert a batch into all buffers; an error of one keeps no other from it. The first error, or None."""
+        """Insert a batch into all buffers, even if one of them raises; return the first error, or None."""
         first = None
         for buffer in self._buffers:
             late = self._late.get(buffer) if self._late else None
@@ -566,7 +566,7 @@ class Bus:
                     continue
                 late.insert(batch)
                 if late.has_caught_up:
-                    # A wake-up that publishes may have been first.
+                    # A wake-up that publishes may have removed it already.
                     self._late.pop(buffer, None)
             except BaseException as error:  # noqa: BLE001 - it is raised after all have the batch
                 first = first or error
@@ -585,18 +585,18 @@ class Bus:
         return self._topology.recorded_time()
 
     def _kept_samples(self) -> AbstractContextManager[None]:
-        """A ``with`` for samples that were kept for those who join later, and may be old. Called by links."""
+        """A ``with`` for samples that were kept for late joiners, and may be old. Called by links."""
         return self._topology.kept_samples()
 
     def _well_typed(self, samples: object) -> Batch:
         """The samples in a batch; anything else in it is counted as rejected."""
         things = tuple(samples) if isinstance(samples, Iterable) else (samples,)
-        batch = tuple(thing for thing in things if isinstance(thing, TransformStamped))
-        if len(batch) < len(things):
-            for thing in things:
-                if not isinstance(thing, TransformStamped):
-                    self._topology.reject("not a sample", TypeError(f"expected a TransformStamped, not {thing!r}"))
-        return batch
+        if all(issubclass(kind, TransformStamped) for kind in set(map(type, things))):
+            return things
+        for thing in things:
+            if not isinstance(thing, TransformStamped):
+                self._topology.reject("not a sample", TypeError(f"expected a TransformStamped, not {thing!r}"))
+        return tuple(thing for thing in things if isinstance(thing, TransformStamped))
 
     def _clock_jumped(self, before: int, after: int) -> None:
         self._topology.clock_moved(after)

@@ -43,22 +43,26 @@ _REFUSED_FRAMES = 1_000
 class EventQueue:
     """Events in the order in which they happened; when there are too many, the oldest are dropped.
 
-    A conflict of authorities is given once for each frame and pair of them. From then on a new parent or kind of that
-    frame is given once for each authority that claims it. A rejected sample is given once for each frame, authority and
-    reason; a stamp ahead of the clock, or behind it, for each frame and authority; and a loop of parents in the past,
-    for each frame, authority and parent. All of this begins anew when the frame is removed or added, and when the clock
-    jumps back.
+    The queue gives some events only once:
 
-    If one authority moves a frame to and fro, every move is an event, because that may be intended. If the queue is
-    full, such a frame pushes out its own events and no others.
+    * a conflict, for each frame and pair of authorities; then a new parent or kind of that frame, for each authority
+      that claims it;
+    * a rejected sample, for each frame, authority and reason;
+    * a stamp ahead of the clock, or behind it, for each frame and authority;
+    * a loop of parents in the past, for each frame, authority and parent.
+
+    This begins anew when the frame is removed or added, and when the clock jumps back.
+
+    If one authority moves a frame to and fro, every move is an event, because it may be intended. If the queue is full,
+    such a frame pushes out its own events and no others.
 
     Parameters
     ----------
     capacity : int
-        How many events may be pending, at least one; those of `known` and of `put_staleness` do not count,
-        and are never dropped.
+        How many events may be pending, at least one; the events of `known` and of `put_staleness` do not count, and are
+        never dropped.
     known : iterable of FrameAdded, StampAhead or StampBehind
-        An event for each frame that has a parent at the beginning, and for each of them that is ahead of the clock, or
+        The first events: for each frame that has a parent, and for each of these frames that is ahead of the clock or
         behind it.
 
     Attributes
@@ -162,7 +166,7 @@ class Staleness:
     def __init__(self, limit: int, newest_edge: Callable[[str], NewestEdge | None]) -> None:
         self._limit = limit
         self._newest_edge = newest_edge
-        # The last stamp at which each frame is surely live, the frames by these, and a heap of them; some are outdated.
+        # The last stamp at which each frame is surely live; the frames by stamp; and a heap of stamps, some outdated.
         self._live: dict[str, int] = {}
         self._due_at: dict[int, dict[str, None]] = {}
         self._due: list[int] = []
@@ -203,7 +207,7 @@ class Staleness:
                 known = self._newest_edge(frame)
                 newest = None if known is None else known.newest
                 if newest is not None and newest + self._limit != due:
-                    # It was heard meanwhile, as nearly all are.
+                    # The usual case: a newer sample has come meanwhile.
                     self._watch(frame, newest + self._limit)
                     continue
                 del self._live[frame]
@@ -215,7 +219,7 @@ class Staleness:
     def due(self) -> int | None:
         """The first stamp, in ns, at which `changes` may have something new if no sample arrives; None if never.
 
-        Call `changes` first: it looks at what was noted.
+        Call `changes` first, which works on the noted frames.
         """
         while self._due and self._due[0] not in self._due_at:
             heappop(self._due)
@@ -260,8 +264,8 @@ class Staleness:
 class EventStream(OneReaderStream[Event]):
     """The result of `Bus.events`: ``async for event in events``, for one reader.
 
-    The iteration ends when the bus or the stream is closed and what was pending has been read. Stale frames are
-    found while a task reads and nothing else is pending; their events are never dropped.
+    The iteration ends when the bus or the stream is closed and all pending events have been read. The stream looks for
+    stale frames while a task reads and nothing else is pending; their events are never dropped.
     """
 
     def __init__(
@@ -285,7 +289,7 @@ class EventStream(OneReaderStream[Event]):
 
     @property
     def dropped(self) -> int:
-        """Events that the reader was too slow for."""
+        """Number of events that were dropped because the reader was too slow."""
         return self.queue.dropped
 
     def put(self, event: Event) -> None:

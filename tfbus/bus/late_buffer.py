@@ -1,19 +1,19 @@
 """A buffer that joined a bus after samples had been published, until it has caught up.
 
-The invariant: the newest parent and kind of each frame of a buffer are those of the newest edge of its bus. A frame of
-which the bus has no edge, because it comes from a prefill, is in no loop with the edges of the bus. So no buffer ever
-holds a newest topology that the bus would refuse.
+The invariant: each frame has the same newest parent and kind in a buffer as on its bus. A frame from a prefill may have
+no edge on the bus; then it forms no loop with the edges of the bus. So no buffer ever holds a newest topology that the
+bus would refuse.
 
-A buffer that was there from the beginning keeps this by itself, because it gets every accepted sample. A buffer that
-joined late has not::
+A buffer that joined before the first sample keeps the invariant by itself, because it gets every accepted sample. A
+buffer that joined late does not::
 
     published    c below a at 10,  c below b at 20,  [the buffer joins],  c below a at 15 (late)
     the bus      c below b: the newest stamp decides
     the buffer   would take c below a for the newest, because it has seen nothing else
 
 So `LateBuffer` leaves out a late sample that names another parent than the newest edge of the bus, until the buffer has
-seen a sample as new as that edge. A prefill may hold a frame with another newest parent than the bus, or one that
-closes a loop with edges of the bus: `LateBuffer` removes that frame.
+seen a sample as new as that edge. If a frame of the prefill has another newest parent than on the bus, or closes a loop
+with edges of the bus, `LateBuffer` removes it.
 """
 
 from tfbus.bus.topology import Topology
@@ -22,7 +22,7 @@ from tfbus.waiting.live_tree import LiveTree
 
 
 class LateBuffer:
-    """The differences between the newest edges of a bus and those of a buffer that has just joined.
+    """The differences between the newest edges of a bus and of a buffer that has just joined.
 
     Parameters
     ----------
@@ -50,8 +50,8 @@ class LateBuffer:
             elif edge.newest is not None and history.newest is not None and history.newest > edge.newest:
                 self._foreign.add(child)
         for child, edge in topology.moving().items():
-            held = None if child not in self._frames else self._frames[child].newest
-            if edge.newest is not None and (held is None or held < edge.newest):
+            prefilled = None if child not in self._frames else self._frames[child].newest
+            if edge.newest is not None and (prefilled is None or prefilled < edge.newest):
                 self._unseen[child] = edge.parent, edge.newest
         for child in tuple(self._foreign):
             self._open_loop(child)
@@ -109,7 +109,7 @@ class LateBuffer:
             self._open_loop(child)
 
     def _open_loop(self, child: str) -> None:
-        """Remove the frames of the prefill that stand in a loop with a frame, by the newest edges of the bus."""
+        """Remove the frames of the prefill that form a loop with a frame, by the newest edges of the bus."""
         walk: dict[str, None] = {}
         here: str | None = child
         while here is not None and here not in walk:

@@ -1,20 +1,20 @@
 """The right to publish a child: by reservation, or by being its first authority if the policy says so.
 
-A reservation also keeps the place of a frame. Let ``arm`` reserve ``t`` and put it below ``a``; somebody else cannot
-take ``t``, but can try to hang ``a`` below ``t``::
+A reservation also keeps the place of a frame. Let ``arm`` reserve ``t`` and put it below ``a``. Another authority
+cannot publish ``t``, but it can try to put ``a`` below ``t``::
 
     arm       t below a
-    intruder  a below t          the two close a loop, and one has to go
+    intruder  a below t          the two edges close a loop: the bus has to refuse one
 
-Without reservations the sample that closes the loop is refused. Here the intruder's edge goes, whichever came first:
+Without reservations the bus refuses the sample that closes the loop. Here it refuses the intruder's edge, whichever
+came first:
 
 * the intruder comes second: its sample closes the loop and is refused, as always;
-* both are in one batch: `Ownership.intruder` names the intruder's sample, and the bus refuses that one;
-* the intruder was first, when ``t`` had no parent yet: its edge is removed from the bus, with its frame, when ``arm``
-  publishes.
+* both are in one batch: `Ownership.intruder` names the intruder's sample, and the bus refuses it;
+* the intruder came first, when ``t`` had no parent yet: the bus removes ``a`` when ``arm`` publishes.
 
-A loop may have several such edges. The one that was published last by somebody who does not own the frame goes first.
-An edge of a frame that its own sender has reserved stays: then the sample of ``arm`` is the wrong one.
+If several edges of a loop come from intruders, the edge that was published last is removed first. If the sender of an
+edge has reserved its child, the edge stays, and the sample of ``arm`` is refused.
 """
 
 import math
@@ -96,7 +96,7 @@ class Ownership:
         Raises
         ------
         InvalidTransformError
-            If the name cannot be that of a frame, or another authority has reserved it (``reason="reserved"``).
+            If the name cannot be the name of a frame, or another authority has reserved it (``reason="reserved"``).
         TypeError
             If `authority` is not a string.
         """
@@ -139,12 +139,12 @@ class Ownership:
     def intruder(
         self, error: InvalidTransformError, edges: Mapping[str, DatedEdge], batch: Batch
     ) -> InvalidTransformError | None:
-        """The error of the edge by somebody else that keeps a reserved frame from its place.
+        """The error of another authority's edge that keeps a reserved frame from its place.
 
         Parameters
         ----------
         error : InvalidTransformError
-            Of a sample that closes a loop of parents.
+            The error of a sample that closes a loop of parents.
         edges : mapping of child to its newest edge
         batch : tuple of TransformStamped
             The batch that the sample is in.
@@ -152,9 +152,9 @@ class Ownership:
         Returns
         -------
         InvalidTransformError or None
-            The error of the edge in the loop that was published last by an authority that does not own the frame of
-            the sample. None if that frame is not reserved for its sender, or all other edges are of the sender or of
-            authorities that have reserved them: then the sample itself is the wrong one.
+            Among the edges of the loop by other authorities, the error of the edge that was published last. None if the
+            sample itself has to be refused: its frame is not reserved for its sender, or the children of all other
+            edges are reserved for their senders.
         """
         frame, owner = error.child, error.authority
         if frame is None or owner is None or self.reserved_for(frame) != owner:

@@ -15,7 +15,7 @@ TimedBatch = tuple[int, Batch]
 
 
 def check_capacity(capacity: object, name: str = "capacity") -> None:
-    """Raise `TypeError` or `ValueError` unless something can hold that many; `name` is for the error."""
+    """Raise `TypeError` or `ValueError` unless this is an int of at least one; `name` is for the error."""
     if isinstance(capacity, bool) or not isinstance(capacity, int):
         raise TypeError(f"{name} must be an int, not {capacity!r}")
     if capacity < 1:
@@ -30,18 +30,18 @@ class SampleQueue:
     Parameters
     ----------
     capacity : int
-        How many moving samples may be pending; at least one. With ``"conflate"`` that is a number of children.
+        How many moving samples may be pending, at least one; with ``"conflate"``, of how many children.
     overflow : {"conflate", "drop_oldest"}
-        ``"conflate"`` keeps the newest sample a child and, when there are too many children, drops the one that
-        has waited longest. ``"drop_oldest"`` drops the oldest whole batches, also when more than `capacity` batches
-        are pending (all static, they would never fill the queue); the newest batch always stays.
+        ``"conflate"`` keeps the newest sample of each child; when there are too many children, it drops the child that
+        has waited longest. ``"drop_oldest"`` drops the oldest whole batches. It also does so when more than `capacity`
+        batches are pending, because static samples alone would never fill the queue. The newest batch always stays.
 
     Attributes
     ----------
     dropped : int
         Moving samples lost to the capacity, or discarded with their frame or their time.
     conflated : int
-        Moving samples that gave way to another one of the same child; only with ``"conflate"``.
+        Moving samples that another sample of the same child has replaced; only with ``"conflate"``.
     """
 
     def __init__(self, capacity: int, overflow: Overflow) -> None:
@@ -52,8 +52,8 @@ class SampleQueue:
         self.overflow: Overflow = overflow
         self.dropped = 0
         self.conflated = 0
-        # With "conflate", the newest sample of each child; with "drop_oldest", batches and the static samples of those
-        # that were dropped.
+        # With "conflate", the newest sample of each child; with "drop_oldest", batches, and the static samples of
+        # dropped batches.
         self._newest: dict[str, TransformStamped] = {}
         self._batches: deque[TimedBatch] = deque()
         self._kept: dict[str, tuple[int, TransformStamped]] = {}
@@ -85,7 +85,7 @@ class SampleQueue:
                 self._drop_batch()
 
     def get(self) -> Batch | None:
-        """The next batch; with ``"conflate"``, all that is pending as one. None when there is nothing."""
+        """The next batch; with ``"conflate"``, all pending samples as one batch. None when there is nothing."""
         if self._newest:
             batch = tuple(self._newest.values())
             self._newest.clear()
@@ -117,14 +117,14 @@ class SampleQueue:
         self._keep_only(lambda sample: sample.static)
 
     def statistics(self, kind: str) -> QueueStatistics:
-        """The queue's counters; `kind` says what it is for."""
+        """The queue's counters; `kind` is its purpose."""
         return QueueStatistics(kind, self.overflow, self.capacity, len(self), self.dropped, self.conflated)
 
     def _conflate(self, sample: TransformStamped) -> None:
         pending = self._newest.get(sample.child)
         if pending is not None:
             self.conflated += not pending.static
-            # The last kind wins; of moving samples, the newest stamp.
+            # The last kind wins; among moving samples, the newest stamp wins.
             if not (sample.static or pending.static) and sample.stamp < pending.stamp:
                 return
             del self._newest[sample.child]
@@ -157,7 +157,7 @@ class SampleQueue:
         return published, batch
 
     def _keep_static(self, published: int, sample: TransformStamped) -> None:
-        # Behind the others, so that the order is that of publication.
+        # Behind the others, to keep the order of publication.
         self._kept.pop(sample.child, None)
         self._kept[sample.child] = published, sample
 
@@ -183,7 +183,7 @@ def _count_moving(samples: Iterable[TransformStamped]) -> int:
 class Stream(OneReaderStream[Batch]):
     """The result of `Bus.stream`: ``async for batch in stream``, for one reader.
 
-    The iteration ends when the bus or the stream is closed and what was pending has been read.
+    The iteration ends when the bus or the stream is closed and all pending batches have been read.
     """
 
     def __init__(
@@ -198,7 +198,7 @@ class Stream(OneReaderStream[Batch]):
 
     @property
     def dropped(self) -> int:
-        """Moving samples that the reader was too slow for."""
+        """Number of moving samples that were dropped because the reader was too slow."""
         return self.queue.dropped
 
     def put(self, batch: Batch) -> None:

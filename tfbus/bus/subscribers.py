@@ -52,9 +52,9 @@ class SeenKeys:
 class OnceLogger:
     """Writes a log line the first time that its key is seen; the last thousand keys are kept.
 
-    A line that repeats at 100 Hz buries all others, and so do the lines about ten thousand frames of a stranger: in a
-    minute, `LINES` of one kind are written. Callers count each case. Names and errors of strangers may be arguments as
-    they are: none of them begins a line of its own.
+    A line that repeats at 100 Hz hides all others, and so do lines about ten thousand frames of a stranger. So at most
+    `LINES` lines of one kind are written in a minute. Callers count each case. Names and errors of strangers are safe
+    as arguments: they cannot begin a new line.
     """
 
     def __init__(self, logger: logging.Logger) -> None:
@@ -89,7 +89,7 @@ class OnceLogger:
 
 
 class _Printable:
-    """An argument of a line; made a text when a handler wants the line, as other arguments are."""
+    """An argument of a log line; formatted only when a handler writes the line."""
 
     __slots__ = ("_value",)
 
@@ -237,7 +237,7 @@ class Subscribers:
             while self._backlog:
                 self._current = self._backlog.popleft()
                 for key in tuple(self.callbacks):
-                    # A callback may have ended another, or removed what the batch is about.
+                    # A callback may have closed another registration, or removed a frame of the batch.
                     if self._current and key in self.callbacks:
                         self._calling = self.callbacks[key]
                         self._call(key, self._calling, self._current)

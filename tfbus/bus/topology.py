@@ -69,7 +69,8 @@ class Plausibility:
     max_translation : float
     rejects_ahead : bool
     lasting : int
-        How long the plausible stamps may be used without looking at the clock, in ns; a simulated one tells its moves.
+        In ns: for how long the plausible stamps are used before the clock is read again. A simulated clock reports its
+        moves.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class Plausibility:
 
     @contextmanager
     def kept_samples(self) -> Iterator[None]:
-        """A ``with`` for samples that were kept for those who join later; none of them is behind."""
+        """A ``with`` for samples that were kept for late joiners; none of them is behind."""
         self._kept += 1
         try:
             yield
@@ -183,7 +184,7 @@ def as_invalid(invalid: Invalid) -> Invalid:
 
 
 def as_max_frames(value: int | None) -> int | None:
-    """The argument `max_frames`; `TypeError` or `ValueError` if it is no number of frames, nor None."""
+    """The argument `max_frames`; `TypeError` or `ValueError` if it is neither a number of frames nor None."""
     if isinstance(value, bool) or not isinstance(value, int | None):
         raise TypeError(f"max_frames must be an int or None, not {value!r}")
     if value is not None and value < 2:
@@ -241,8 +242,8 @@ class Topology:
     ahead : int
         Accepted samples that were ahead of the clock.
     judge : Judge
-        Records the samples of a batch if all continue known edges; else `accept` has to look. It counts the accepted
-        samples that were behind the clock.
+        Records the samples of a batch if all continue known edges; otherwise `accept` judges them. It counts the
+        accepted samples that were behind the clock.
     """
 
     def __init__(
@@ -263,7 +264,8 @@ class Topology:
         self._parents = 0
         self._newest: dict[str, _Edge] = {}
         self.names = KnownFrames()
-        # It compares stamps with the clock of at most a tenth of a second ago, or of the last move of a simulated one.
+        # The judge compares stamps with a reading of the clock that is at most a tenth of a second old; a simulated
+        # clock is read after each of its moves.
         self.judge = Judge(self._newest, plausibility.max_translation**2)
         self.latched: dict[str, TransformStamped] = {}
         self.rejected: Counter[str] = Counter()
@@ -303,7 +305,7 @@ class Topology:
         ]
 
     def known_behind(self) -> list[StampBehind]:
-        """An event for each child that was told to be behind the clock, and whose newest sample is so still."""
+        """An event for each child that was reported as behind the clock, and whose newest sample still is."""
         now, oldest = self._announcer.now(), self._plausibility.oldest_plausible()
         return [
             StampBehind(now, child, known.newest, None, known.authority)
@@ -312,9 +314,9 @@ class Topology:
         ]
 
     def expired(self, sample: TransformStamped, newest: int, authority: str) -> bool:
-        """Tell that a sample has expired in a buffer, by the newest stamp (ns) of its child, which is of an authority.
+        """Report a sample that has expired in a buffer; `newest` (ns) and `authority` are of its child's newest sample.
 
-        Returns whether that stamp is ahead of the clock, so that right samples expire.
+        Returns whether `newest` is ahead of the clock, so that correct samples expire.
         """
         if newest > self._plausibility.newest_plausible():
             self._tell_ahead(sample.child, newest, authority)
@@ -326,15 +328,15 @@ class Topology:
     def accept(self, batch: Batch, invalid: Invalid, judged: bool = False) -> Batch:
         """Judge a batch, record the samples that may be committed, and return them.
 
-        `judged` says that the judge has been asked, and did not accept it.
+        `judged` says that the judge has already been asked and has handed the batch back.
 
         Raises
         ------
         InvalidTransformError
-            If `invalid` is ``"raise"`` and a sample closes a loop, or its authority may not publish the child; then
-            nothing was noted.
+            If `invalid` is ``"raise"`` and a sample closes a loop, or its authority may not publish the child. Nothing
+            is recorded.
         """
-        # Nearly always all samples continue known edges, so that only the stamps are new.
+        # The usual case: all samples continue known edges, and only the stamps are new.
         if (not judged and self.judge.accepts(batch)) or self._accepts_now(batch):
             return batch
         return self._judge(batch, invalid)
@@ -383,13 +385,13 @@ class Topology:
 
     @contextmanager
     def kept_samples(self) -> Iterator[None]:
-        """A ``with`` for samples that were kept for those who join later; none of them is behind."""
+        """A ``with`` for samples that were kept for late joiners; none of them is behind."""
         with self._at_the_clock(self._plausibility.kept_samples()):
             yield
 
     @contextmanager
     def _at_the_clock(self, other_rules: AbstractContextManager[None]) -> Iterator[None]:
-        """A ``with`` in which the judge goes by other rules."""
+        """A ``with`` in which the judge follows other rules."""
         try:
             with other_rules:
                 self._look_at_clock()
@@ -402,12 +404,12 @@ class Topology:
         self._look_at_clock()
 
     def _look_at_clock(self) -> None:
-        """Let the judge compare stamps with the time that it is now."""
+        """Give the judge a new reading of the clock."""
         plausibility = self._plausibility
         self.judge.allow(plausibility.oldest_plausible(), plausibility.newest_plausible(), plausibility.lasting)
 
     def _accepts_now(self, batch: Batch) -> bool:
-        """Whether the judge accepts a batch by the time that it is now."""
+        """Whether the judge accepts a batch after a new reading of the clock."""
         self._look_at_clock()
         return self.judge.accepts(batch)
 
@@ -452,17 +454,17 @@ class Topology:
         return accepted
 
     def _fits(self, batch: Batch, max_frames: int) -> bool:
-        """Whether the bus has places for the frames of a batch, which may give up some as it takes others."""
+        """Whether the bus has places for the frames of a batch, which may free some and take others."""
         # No sample names more than two new frames.
         if len(self.names) + 2 * len(batch) <= max_frames:
             return True
         if self._ownership.reserves:
-            # Some of it may yet be refused, and then would give up nothing.
+            # A sample that is refused later frees no place.
             return False
         return self.names.count_after(changed_parents(self._newest, batch)) <= max_frames
 
     def _find_places(self, batch: Batch, max_frames: int) -> tuple[Batch, list[InvalidTransformError]]:
-        """The samples of a batch whose frames find a place that is free by now, and the errors of the others."""
+        """The samples of a batch whose frames fit into the free places, and the errors of the others."""
         before = len(self.names)
         allowed: list[TransformStamped] = []
         refused: list[InvalidTransformError] = []
@@ -497,7 +499,7 @@ class Topology:
         Returns
         -------
         accepted, looped
-            As of `admit`.
+            As `admit` gives them.
         """
         edges = dict(self._newest)
         removed: list[InvalidTransformError] = []
@@ -514,7 +516,7 @@ class Topology:
             _, looped = admit(edges, batch, self.names.parents)
         if invalid == "drop" or not (looped or refused):
             for error in removed:
-                # Its samples were accepted, so they are not counted as the others that are refused.
+                # Its samples were accepted, so they are not counted as refused.
                 self.reject("displaced", error)
                 self._log.warning(("intruder", error.child, error.authority), "removed a frame: %s", error)
                 self._evict(_child(error))

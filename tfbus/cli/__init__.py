@@ -1,31 +1,31 @@
-"""The command ``tfbus``; of its subcommands in `tfbus.cli.commands` only the one that is called is loaded.
+"""The command ``tfbus``. Of the subcommands in `tfbus.cli.commands`, it loads only the one that is called.
 
 Standard output carries the result of a command; notices, warnings and errors go to standard error.
 """
 
-# Not `signal`, which loads enum: meanwhile Ctrl-C would still be a traceback.
+# `signal` would load enum, and Ctrl-C would still show a traceback meanwhile.
 import _signal as signal  # type: ignore[import-not-found]
 import gc
 import sys
 
 
 def main() -> None:
-    """Run the command and exit with the status that its help names; Ctrl-C ends it at any instant without a traceback.
+    """Run the command and exit with the status that its help names; Ctrl-C never shows a traceback.
 
     While modules are loaded, and after the command has ended, Ctrl-C has its default action, which is silent: a
     `KeyboardInterrupt` would show a traceback there.
     """
-    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
     def begin() -> None:
         gc.freeze()
         gc.enable()
-        if heard:
+        if is_default:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    if heard:
+    if is_default:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    # Modules are no garbage: to search them for some while they are loaded takes a sixth of the time of the help.
+    # Modules are never garbage: a collection while they are loaded takes a sixth of the time of the help.
     gc.disable()
     from tfbus.cli.application import run
 
@@ -33,6 +33,6 @@ def main() -> None:
         status = run(sys.argv[1:], begin)
     finally:
         gc.enable()
-        if heard:
+        if is_default:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
     sys.exit(status)

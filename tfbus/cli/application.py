@@ -1,9 +1,9 @@
-"""The command line: the subcommands, the options of all of them, and the exit status for whatever happens.
+"""The command line: the subcommands, their common options, and the exit status.
 
-`run` parses the words with cyclopts, which loads the module of the one subcommand that they name. The help of all and
-the version are printed without cyclopts, which takes several times as long to load. A subcommand returns its exit
-status, or None for success. It raises `UsageError`, a `RecordingError` or a `TransformLookupError` for what a user can
-cause, and `run` prints a line for each.
+`run` parses the words with cyclopts, and loads the module of the one subcommand that they name. The help of all and the
+version are printed without cyclopts, which takes several times as long to load. A subcommand returns its exit status,
+or None for success. For a fault that a user can cause, it raises `UsageError`, a `RecordingError` or a
+`TransformLookupError`, and `run` prints a line for each.
 """
 
 import os
@@ -22,7 +22,7 @@ COMMANDS = {
     "bridge": "Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.",
     "broadcast": "Broadcast the transform of the tutorial's laser, until Ctrl-C; tfbus listen in another terminal "
     "receives it.",
-    "check": "Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.",
+    "check": "Find faults in a recording, or in a domain for some time: which, when, how often, and what to do.",
     "compare": "Compare the trajectory of a frame in two recordings: absolute and relative pose error, aligned and "
     "not.",
     "convert": "Write recordings to a new one: in another format, a part of them, renamed, or several merged by their "
@@ -41,8 +41,8 @@ COMMANDS = {
     "record": "Record all transforms of a domain to FILE, in MCAP as ROS 2 and Foxglove read it, until Ctrl-C.",
     "robot": "Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at "
     "zero.",
-    "router": "Pass on what programs of all domains send each other, until Ctrl-C.",
-    "static": "Publish the static transform of CHILD in PARENT, or all that a file holds, until Ctrl-C.",
+    "router": "Connect the programs of all domains with each other, until Ctrl-C.",
+    "static": "Publish the static transform of CHILD in PARENT, or all transforms of a file, until Ctrl-C.",
     "tree": "Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.",
     "view": "Show the frames of a domain, or of a recording, as a live 3D page in the browser, until Ctrl-C.",
 }
@@ -53,13 +53,13 @@ _MODULES = dict.fromkeys(("broadcast", "demo", "listen"), "tutorial")
 _SUMMARY = "Stamped coordinate transforms for asyncio and trio."
 _EXIT_STATUSES = (
     "Exit status: 0 success; 1 a lookup or a recording has failed, or a check has found something; 2 wrong usage, or a "
-    "file that cannot be used; 130 ended by Ctrl-C; 143 ended by a termination. Variables of the environment: "
+    "file that cannot be used; 130 ended by Ctrl-C; 143 ended by a termination. Environment variables: "
     "TFBUS_DOMAIN, TFBUS_CONNECT (addresses with blanks between them), TFBUS_RUNTIME_DIR (where programs of this "
     "machine meet), NO_COLOR."
 )
-_INSTALL_COMPLETION = "Install completion for the shell that is in use, and exit."
+_INSTALL_COMPLETION = "Install completion for the current shell, and exit."
 _OPTIONS_OF_ALL = "Options of all commands"
-_LOG_LEVEL = "The least important log lines that are shown on standard error."
+_LOG_LEVEL = "Show log lines of this level and above on standard error."
 
 _LogLevel = Literal["debug", "info", "warning", "error", "critical"]
 _DEFAULT_LEVEL: Final = "warning"
@@ -132,7 +132,7 @@ def _overview() -> str:
 
 
 def _panel(title: str, rows: Mapping[str, str], width: int) -> str:
-    """A box with a name and its meaning a row."""
+    """A box; each row has a name and its meaning."""
     names = max(map(len, rows))
     room = max(width - names - 6, 8)
     lines = [
@@ -145,7 +145,7 @@ def _panel(title: str, rows: Mapping[str, str], width: int) -> str:
 
 
 def application(command: str | None) -> Any:
-    """The command line with all its subcommands, none of which is loaded before it is parsed.
+    """The command line with all its subcommands; a subcommand is loaded only when it is parsed.
 
     Parameters
     ----------
@@ -161,13 +161,13 @@ def application(command: str | None) -> Any:
     except ImportError:
         from tfbus.errors import pip_install
 
-        raise SystemExit(f"tfbus: the command needs some packages more: {pip_install('cli')}") from None
+        raise SystemExit(f"tfbus: the command needs more packages: {pip_install('cli')}") from None
     app = App(
         name="tfbus",
         help=_SUMMARY,
         version=_version,
         help_epilogue=_EXIT_STATUSES,
-        # To load a parser of Markdown takes as long as all the rest of the list of commands.
+        # Loading a parser of Markdown takes as long as everything else for the list of commands.
         help_format="plaintext" if command is None else "markdown",
         suppress_keyboard_interrupt=False,
         default_parameter=Parameter(negative_iterable="", show_default=_shown_default),
@@ -198,7 +198,7 @@ def _shown_default(default: object) -> str | None:
     return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
 
 
-# These are loaded where they are used: the help and the version do without most of them.
+# The modules below are loaded where they are used, because the help and the version need few of them.
 
 
 def _version() -> str:

@@ -34,7 +34,7 @@ from tfbus.stamps import SECOND, as_stamp
 T = TypeVar("T")
 
 _PATIENCE: Final = 5.0
-"""s. The transforms of a simulation often arrive before its clock, which would show them as decades old."""
+"""The time in s to wait for a simulated clock: transforms often arrive before it, and would seem decades old."""
 _DDS = re.compile(r"dds(?::(\d{1,3}))?")
 _ZENOH = re.compile(r"zenoh:(.+:\d+)")
 _WEBSOCKET = re.compile(r"wss?://.*")
@@ -42,7 +42,7 @@ _RETRY = 1.0
 """The time between two attempts, in s."""
 _SILENCE_BEFORE_NOTICE = 1.0
 """s."""
-_NO_ZENOH = f"--connect and --listen need a package more: {pip_install('cli,zenoh')}"
+_NO_ZENOH = f"--connect and --listen need one more package: {pip_install('cli,zenoh')}"
 
 
 class RemoteLookups(Protocol):
@@ -108,12 +108,12 @@ class LinkOptions:
 
     @property
     def place(self) -> str:
-        """The place that is joined, for people."""
+        """The place that is joined, in words."""
         return f"ROS at {' and '.join(self.ros)}" if self.ros else f"domain {self.domain!r}"
 
     @property
-    def way(self) -> str:
-        """The way to others, for people."""
+    def route(self) -> str:
+        """The route to other programs, in words."""
         if self.ros:
             return f"in {self.place}"
         if self.listen:
@@ -129,8 +129,8 @@ class LinkOptions:
         ----------
         program : async callable
         clock : Clock, optional
-            The clock of the bus. The time of a `SimulatedClock` is told to the domain; a `ReplayClock` follows the time
-            that is told there.
+            The clock of the bus. The domain is told the time of a `SimulatedClock`; a `ReplayClock` follows the time of
+            the domain.
         links : list, optional
             Is given the links of the bus before the program begins.
 
@@ -186,7 +186,7 @@ class LinkOptions:
             yield [link]
 
     def run_remote(self, program: Callable[[RemoteLookups], Awaitable[T]]) -> T:
-        """Run a program that asks the buffer of another program, that of the robot in `robots`, until its end.
+        """Run a program that asks the buffer of the robot in `robots`, in another process, until its end.
 
         Raises
         ------
@@ -197,7 +197,7 @@ class LinkOptions:
         """
         if len(self.robots) > 1:
             raise UsageError("--remote asks the buffer of one robot: give --robots once")
-        # A robot of rate 0 says who is there, and no more.
+        # With the rate 0, the link learns who is there and receives no transforms.
         options: DomainOptions = {"robots": dict.fromkeys(self.robots or ("*",), 0.0)}
 
         async def enter_and_run() -> T:
@@ -238,14 +238,14 @@ class LinkOptions:
                 await arrived.wait()
                 return
             say(f"waiting for transforms on {self.place} …")
-            self.say_who_is_heard(links)
+            self.print_peers(links)
             await arrived.wait()
 
-    def say_who_is_heard(self, links: Sequence[Link]) -> None:
+    def print_peers(self, links: Sequence[Link]) -> None:
         """Print how many peers the links have, and how they are reached; nothing without a link."""
         if links:
             peers = sum(len(link.peers) for link in links)
-            say(f"hears {'nobody' if not peers else '1 peer' if peers == 1 else f'{peers:,} peers'} {self.way}")
+            say(f"hears {'nobody' if not peers else '1 peer' if peers == 1 else f'{peers:,} peers'} {self.route}")
 
 
 DEFAULT_LINK = LinkOptions()
@@ -294,37 +294,37 @@ def run(main: Callable[[], Awaitable[T]], backend: str) -> T:
 
 
 class ReplayClock(SystemClock):
-    """The time of the machine until the first stamp is heard, and then the newest stamp that was heard.
+    """The machine's time until the first stamp of a replay arrives, and then the newest stamp that has arrived.
 
-    So the ages of transforms are ages of then. Durations, rates and timeouts stay those of the machine: a command goes
+    So ages are counted in the time of the replay. Durations, rates and timeouts use the machine's time: a command goes
     on while the replay is paused.
     """
 
     def __init__(self) -> None:
-        self._told: int | None = None
+        self._replayed: int | None = None
         self._patient_until = time.monotonic() + _PATIENCE
-        self._heard = anyio.Event()
+        self._arrival = anyio.Event()
         self._callbacks: dict[object, JumpCallback] = {}
 
     @property
     def is_set(self) -> bool:
-        """Whether a stamp was heard, or none has come for so long that the time is the machine's."""
-        return self._told is not None or time.monotonic() >= self._patient_until
+        """Whether a stamp has arrived, or none has for so long that the machine's time counts."""
+        return self._replayed is not None or time.monotonic() >= self._patient_until
 
     def now(self) -> int:
-        """The newest stamp that was heard, or the machine's time; in ns."""
-        return super().now() if self._told is None else self._told
+        """The newest stamp that has arrived, or the machine's time; in ns."""
+        return super().now() if self._replayed is None else self._replayed
 
     def hear(self, stamp: int) -> None:
         """Take the time of the replay, in ns; an earlier one is a jump back.
 
-        The first one is another clock's, so that it is no earlier or later time: it is told as a jump to itself, and
-        what has arrived before it stays.
+        The first stamp is of another clock than the time before, so it is neither earlier nor later. It is announced as
+        a jump to itself, and samples that arrived before it stay.
         """
-        before = stamp if self._told is None else self._told
-        first, self._told = self._told is None, stamp
-        heard, self._heard = self._heard, anyio.Event()
-        heard.set()
+        before = stamp if self._replayed is None else self._replayed
+        first, self._replayed = self._replayed is None, stamp
+        arrival, self._arrival = self._arrival, anyio.Event()
+        arrival.set()
         if first or stamp < before:
             for callback in tuple(self._callbacks.values()):
                 callback(before, stamp)
@@ -337,8 +337,8 @@ class ReplayClock(SystemClock):
             if now < before:
                 raise ClockResetError(before=before, after=now)
             before = now
-            with anyio.move_on_after((wanted - now) / SECOND if self._told is None else None):
-                await self._heard.wait()
+            with anyio.move_on_after((wanted - now) / SECOND if self._replayed is None else None):
+                await self._arrival.wait()
 
     def on_jump(self, callback: JumpCallback) -> Registration:
         """Call `callback` with the stamps before and after each jump."""
@@ -383,17 +383,17 @@ def ros_link(bus: Bus, place: str, **options: Any) -> Link:
     except (ImportError, ValueError) as error:
         raise UsageError(str(error)) from None
     raise UsageError(
-        f"{place!r} is no place of ROS: write dds, dds:42 for ROS_DOMAIN_ID 42, zenoh:host:7447, or ws://host:9090"
+        f"{place!r} is not a place of ROS: write dds, dds:42 for ROS_DOMAIN_ID 42, zenoh:host:7447, or ws://host:9090"
     )
 
 
 async def publish_static(
     bus: Bus, samples: Sequence[TransformStamped], *, task_status: TaskStatus[None] = anyio.TASK_STATUS_IGNORED
 ) -> None:
-    """Publish static samples; one that the bus refuses is shown once, and tried again until it is accepted.
+    """Publish static samples; a refused sample is shown once, and tried again until it is accepted.
 
-    A refused sample may close a loop with an edge of another program, which may end. As a task it has started once
-    each sample has been tried.
+    A refused sample may close a loop with an edge of another program, and that program may end. As a task, it has
+    started once each sample has been tried.
     """
     warned: set[str] = set()
     pending = _publish_each(bus, samples, warned)

@@ -46,7 +46,7 @@ def fitted(line: str, indent: int = 2) -> str:
 
 
 def say(line: str) -> None:
-    """Print a notice to standard error, in one line whatever names are in it."""
+    """Print a notice to standard error, in one line, even if a name in it has line breaks."""
     print(printable(line), file=sys.stderr, flush=True)
 
 
@@ -56,7 +56,7 @@ def warn(message: str) -> None:
 
 
 def terminal_width() -> int | None:
-    """The greatest length of a line on standard output; None where it is no terminal, which has room for any line.
+    """The greatest length of a line on standard output; None if it is not a terminal: then any line fits.
 
     The variable ``COLUMNS`` of the environment decides, if it is set.
     """
@@ -75,7 +75,7 @@ def cells(text: str) -> int:
 
 
 def shorten(text: str, width: int) -> str:
-    """Cut the middle of a text out, where it is longer than `width`: both ends of a name tell it from others."""
+    """Cut out the middle of a text that is longer than `width`: the ends of a name distinguish it from others."""
     if cells(text) <= width:
         return text
     if width <= 1:
@@ -140,7 +140,7 @@ class Column(NamedTuple):
     right : bool
         Whether its cells stand at the right.
     importance : int or None
-        Where the table is too wide, the column with the lowest number goes first; None stays always.
+        If the table is too wide, the column with the lowest number is dropped first; a column with None never is.
     """
 
     title: str
@@ -159,7 +159,7 @@ def table_lines(
     rows : sequence of sequence of str
         The cells of each row; names need not be printable.
     width : int, optional
-        The greatest length of a line; where columns that stay always do not fit, their longest cells are shortened.
+        The greatest length of a line; if columns that are never dropped do not fit, their longest cells are shortened.
     titles : bool
         Whether the first line has the titles.
     """
@@ -230,7 +230,7 @@ def csv_writer() -> Any:
 
 
 def csv_name(name: str) -> str:
-    """A name as a cell of CSV: as it is for programs and files, and escaped on a terminal, which would obey it."""
+    """A name as a cell of CSV: unchanged for programs and files; escaped for a terminal, which would obey it."""
     return printable(name) if sys.stdout.isatty() else name
 
 
@@ -282,7 +282,7 @@ def write_file(path: Path, content: bytes) -> None:
 
 @contextmanager
 def log_lines(level: str, first_window: float = _FIRST_WINDOW) -> Iterator[None]:
-    """Show what tfbus logs at a level, or at a higher one, on standard error for the body of a ``with``.
+    """Show the log lines of tfbus, at a level or a higher one, on standard error for the body of a ``with``.
 
     Parameters
     ----------
@@ -307,32 +307,32 @@ class _FoldingHandler(logging.Handler):
     """Prints the first line of a kind with the number of lines that follow within a short time.
 
     Lines are of one kind if they differ only in their arguments. The time doubles each time that a kind comes again, up
-    to `_LONGEST_WINDOW`, and nothing is lost: `close` prints what is still held back.
+    to `_LONGEST_WINDOW`, and nothing is lost: `close` prints all lines that are still held back.
     """
 
     def __init__(self, first_window: float) -> None:
         super().__init__()
         self._first_window = first_window
-        self._held: dict[str, tuple[str, int, threading.Timer]] = {}
+        self._waiting: dict[str, tuple[str, int, threading.Timer]] = {}
         self._windows: dict[str, float] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Hold a line back, or count it to the one of its kind that is held back."""
+        """Hold a line back; or count it, if another line of its kind is held back."""
         kind = str(record.msg)
-        if kind in self._held:
-            line, more, timer = self._held[kind]
-            self._held[kind] = (line, more + 1, timer)
+        if kind in self._waiting:
+            line, more, timer = self._waiting[kind]
+            self._waiting[kind] = (line, more + 1, timer)
             return
         window = self._windows.get(kind, self._first_window)
         self._windows[kind] = min(2 * window, _LONGEST_WINDOW)
         timer = threading.Timer(window, self._tell, (kind,))
         timer.daemon = True
-        self._held[kind] = (self.format(record), 0, timer)
+        self._waiting[kind] = (self.format(record), 0, timer)
         timer.start()
 
     def close(self) -> None:
         """Print all lines that are held back."""
-        for kind, (_, _, timer) in list(self._held.items()):
+        for kind, (_, _, timer) in list(self._waiting.items()):
             timer.cancel()
             self._tell(kind)
         super().close()
@@ -341,11 +341,11 @@ class _FoldingHandler(logging.Handler):
         # A timer calls it in its own thread.
         self.acquire()
         try:
-            held = self._held.pop(kind, None)
+            waiting = self._waiting.pop(kind, None)
         finally:
             self.release()
-        if held is not None:
-            line, more, _ = held
+        if waiting is not None:
+            line, more, _ = waiting
             # Only a traceback has several lines. No message in it begins a line as those of tfbus do.
             first, *traceback = line.split("\n")
             warn(f"{first} (and {more:,} more like it)" if more else first)

@@ -26,7 +26,7 @@ class TopicOptions:
     namespaces
         Read tf and tf_static of all namespaces; the frames of /robot1/tf get the prefix robot1/.
     prefix
-        Put this before the names of all frames.
+        A prefix for the names of all frames.
     """
 
     topic: tuple[str, ...] = ()

@@ -16,7 +16,7 @@ from tfbus.tree.rendering import Branch, branches, facts
 
 _ASCII = str.maketrans("├└─│", "|`-|")
 _LEAST_NAME = 12
-"""The shortest that a name, or a sender, is made while something else can be left out."""
+"""The least width to which a name, or a sender, is shortened while something else can be left out."""
 _LAYOUTS = (
     (4, ("rate", "age", "span", "authority")),
     (4, ("rate", "age", "span")),
@@ -62,7 +62,7 @@ class TreeDisplay:
     def __enter__(self) -> "TreeDisplay":
         if self._live is not None:
             self._live.start()
-            # A killed program could not show it again.
+            # Rich hides the cursor, and a killed program could not show it again.
             self._console.show_cursor()
         return self
 
@@ -142,7 +142,7 @@ def _line(
 
 
 def _fitting(lines: Sequence[Text], height: int) -> Sequence[Text]:
-    """As many lines as fit a terminal, the last of which says how many do not."""
+    """The lines that fit a terminal; if some do not, the last line says how many."""
     if len(lines) <= height:
         return lines
     kept = max(0, height - 1)

@@ -17,7 +17,7 @@ from tfbus.stamps import Latest, as_array, as_stamps
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointCloud(CopiedByFields, PlainData):
-    """Points of a sensor, optionally with an instant of each. Equal only to itself.
+    """Points of a sensor, optionally with an instant for each. Equal only to itself.
 
     The arrays are held as read-only views and not copied: their owner must not change them any more.
 
@@ -42,7 +42,7 @@ class PointCloud(CopiedByFields, PlainData):
 
     Notes
     -----
-    A transform moves all points at once, as they were at its own stamp, and leaves `stamps` and `fields` as they are.
+    A transform moves all points as if they had been seen at its own stamp. It does not change `stamps` and `fields`.
     """
 
     frame: str

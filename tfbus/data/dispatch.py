@@ -18,14 +18,14 @@ from tfbus.stamps import LATEST, Latest, as_array, as_stamp
 
 
 def as_floats(value: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
-    """An array of floats: an array of floats is not copied, integers become float64.
+    """An array of floats: floats are not copied, integers become float64.
 
     Raises
     ------
     TypeError
         If they are not numbers. The message names `name` and the dtype.
     ValueError
-        If one is masked.
+        If an element is masked.
     """
     array = as_array(value, name)
     if array.dtype.kind in "iu":
@@ -85,7 +85,7 @@ FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 
 class DoTransform(Protocol):
-    """The type of `do_transform`: a ``singledispatch`` function that returns what it is given."""
+    """The type of `do_transform`: a ``singledispatch`` function whose result has the type of its first argument."""
 
     def __call__(self, data: DataT, transform: TransformStamped) -> DataT: ...
 
@@ -160,11 +160,11 @@ def moved_header(data: Stamped, transform: TransformStamped) -> tuple[str, int]:
 
 
 def construct(data: Any, *values: object) -> None:
-    """Set the fields of a frozen dataclass, and check them: what its own ``__init__`` does.
+    """Set the fields of a frozen dataclass and check them, as its own ``__init__`` does.
 
-    A class writes its ``__init__`` for the types of its arguments, which are wider than those of its fields.
+    A class writes its ``__init__`` for the types of its arguments, which are wider than the types of its fields.
     """
-    # The fields of a subclass begin with those of its base.
+    # The fields of a subclass begin with the fields of its base.
     for name, value in zip(data.__match_args__, values, strict=False):
         object.__setattr__(data, name, value)
     data.__post_init__()
@@ -192,7 +192,7 @@ def check_pose(pose: object) -> None:
 
 
 def as_triple(value: Any, name: str) -> Vector:
-    """Three numbers as a tuple of floats; NaN and infinity are allowed, since sensors send them.
+    """Three numbers as a tuple of floats; NaN and infinity are allowed, because sensors send them.
 
     Raises
     ------

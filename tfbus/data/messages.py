@@ -1,4 +1,4 @@
-"""`from_message` and `to_message`, between the messages of ROS and stamped data, without ROS.
+"""`from_message` and `to_message`, which convert between messages of ROS and stamped data, without ROS.
 
 Only the names of fields count, so a message may be an object of rclpy, rospy, rosbags or cyclonedds, or a mapping from
 roslib or JSON.
@@ -31,7 +31,7 @@ def has(message: object, name: str) -> bool:
 
 
 def get(message: object, *names: str) -> Any:
-    """The field of a message, of that field, and so on.
+    """The field of a message, or a field inside of a field.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def numbers(message: object, names: Iterable[str]) -> tuple[float, ...]:
 def filled(like: Any, values: Mapping[str, Any]) -> Any:
     """A copy of a message with other values in some fields; fields that are mappings in `values` are copied likewise.
 
-    Arrays and sequences become of the kind of the old value: an ``array``, an array of numpy, bytes or a list.
+    A new sequence takes the kind of the old value: an ``array``, an array of numpy, bytes or a list.
     """
     result = copy(like)
     for name, value in values.items():
@@ -206,7 +206,7 @@ Data = (
     | LaserScan
     | TransformStamped
 )
-"""The types that a message can become, and that can become one."""
+"""The types of data that messages are converted to and from."""
 
 
 def from_message(message: object) -> Any:
@@ -222,18 +222,18 @@ def from_message(message: object) -> Any:
 
     Returns
     -------
-    Data of the type with that name, `Polygon` or `PointCloud`. Leading slashes of frames are gone. A stamp of zero is
-    the stamp 0, not `LATEST`. The points of a cloud and its other fields are views of the message's data, wherever
-    x, y and z lie side by side and rows have no gap between them.
+    Data of the type with that name, `Polygon` or `PointCloud`. Leading slashes of frames are removed. A stamp of zero
+    is the stamp 0, not `LATEST`. The points of a cloud and its other fields are views of the message's data, if x, y
+    and z lie side by side and the rows have no gap between them.
 
     Raises
     ------
     TypeError
-        If the message is none of these; the error names its fields.
+        If the message is not one of these; the error names its fields.
     ValueError
         If a value is not valid, or the data of a cloud do not fit its layout.
     InvalidTransformError
-        If a frame has no name, or a rotation is none.
+        If a frame has no name, or a rotation is invalid.
 
     Examples
     --------
@@ -247,7 +247,7 @@ def from_message(message: object) -> Any:
         return found[0](message, str(get(header, "frame_id")).lstrip("/"), _stamp(get(header, "stamp")))
     known = message if isinstance(message, Mapping) else [name for name in dir(message) if not name.startswith("_")]
     shown = ", ".join(sorted(map(str, known))[:10])
-    raise TypeError(f"a {type(message).__name__} is no message that can be transformed; its fields are {shown}")
+    raise TypeError(f"a {type(message).__name__} is not a message that can be transformed; its fields are {shown}")
 
 
 def to_message(data: Data, like: Any = dict) -> Any:
@@ -258,8 +258,8 @@ def to_message(data: Data, like: Any = dict) -> Any:
     data : stamped data
         Of a type that `from_message` gives.
     like : object, type or mapping
-        A message of the type to make, whose other fields are copied, or that type, if it can be made without
-        arguments; by default, a ``dict`` with the names of ROS 2. It is not changed. A cloud is written in the layout
+        A message of the wanted type, whose other fields are copied and which is not changed; or the type itself, if it
+        can be made without arguments. By default, a ``dict`` with the names of ROS 2. A cloud is written in the layout
         of `like`, which must have the fields x, y and z.
 
     Returns
@@ -269,9 +269,9 @@ def to_message(data: Data, like: Any = dict) -> Any:
     Raises
     ------
     TypeError
-        If the data are of another type, or `like` has not their fields.
+        If the data are of another type, or `like` lacks their fields.
     ValueError
-        If the stamp is `LATEST`, which a message cannot tell, or a field of a cloud does not fit.
+        If the stamp is `LATEST`, which a message cannot express, or a field of a cloud does not fit.
     """
     write = _WRITERS.get(type(data))
     if write is None:
@@ -379,7 +379,7 @@ def _read_wrench(message: object, frame: str, stamp: int) -> WrenchStamped:
     return WrenchStamped(frame, stamp, _triple(message, "wrench", "force"), _triple(message, "wrench", "torque"))
 
 
-# A message with several of these, as nav_msgs/Odometry, is refused: the caller names the part that is meant.
+# A message with several of these, such as nav_msgs/Odometry, is refused: the caller has to choose a part.
 _READERS: dict[str, Callable[[object, str, int], Data]] = {
     "point_step": read_cloud,
     "ranges": _read_scan,

@@ -20,7 +20,7 @@ class LaserScan(CopiedByFields, PlainData):
 
     Ray i goes in the plane z = 0 of `frame` at the angle ``angle_min + i * angle_increment``, counterclockwise from x
     as seen from +z, at the instant ``stamp + i * time_increment``. A scan cannot be transformed, but the cloud that
-    `to_points` gives can. The arrays are held as read-only views and not copied: their owner must not change them.
+    `to_points` gives can. The arrays are held as read-only views, not copied: their owner must not change them.
 
     Parameters
     ----------
@@ -28,12 +28,12 @@ class LaserScan(CopiedByFields, PlainData):
     stamp : int or LATEST
         ns, of the first ray.
     ranges : array of shape (n,)
-        In m. Floats keep their dtype, integers become float64. NaN, infinity and ranges outside the limits are no
+        In m. Floats keep their dtype, integers become float64. NaN, infinity and ranges outside of the limits give no
         points.
     angle_min, angle_increment : float
         In rad; the increment is negative for a laser that sweeps clockwise.
     angle_max : float, optional
-        In rad, of the last ray; by default computed. It is not used, because drivers round it differently.
+        In rad, of the last ray; computed by default. It is not used, because drivers round it differently.
     time_increment : float
         From ray to ray, in s.
     scan_time : float
@@ -102,12 +102,13 @@ class LaserScan(CopiedByFields, PlainData):
         Returns
         -------
         PointCloud
-            Points of shape (m, 3), in the dtype of the ranges, of the m rays with a valid range. `stamps` are those of
-            the rays; None if the stamp of the scan is `LATEST`. The field "index" has the index of each ray in the
-            scan, and "intensities" those of the scan, if any; both are named as in laser_geometry.
+            The points of the m rays with a valid range, shape (m, 3), in the dtype of the ranges. `stamps` has the
+            instants of the rays; it is None if the stamp of the scan is `LATEST`. The field "index" has the index of
+            each ray in the scan, and "intensities" its intensity, if the scan has them; both are named as in
+            laser_geometry.
         """
         ranges = self.ranges
-        # Rounded as the ranges are, so that a range at a limit is valid; too large a limit becomes infinite.
+        # The limits are rounded as the ranges are, so that a range at a limit is valid. A huge limit becomes infinite.
         with np.errstate(over="ignore"):
             low, high = np.array((self.range_min, self.range_max)).astype(ranges.dtype)
         index = np.flatnonzero(np.isfinite(ranges) & (ranges >= low) & (ranges <= high))

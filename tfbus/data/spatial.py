@@ -36,15 +36,15 @@ class PoseWithCovarianceStamped(CopiedByFields, PlainData):
     pose : Transform
         Maps coordinates of the posed body into `frame`.
     covariance : array of shape (6, 6), or 36 numbers row by row
-        Of (x, y, z, rotation about x, y, z) in m and rad, about the fixed axes of `frame`: the order of
+        The covariance of (x, y, z, rotation about x, y, z) in m and rad, about the fixed axes of `frame`: the order of
         geometry_msgs/PoseWithCovariance. Copied as float64, and read-only from then on. Only the shape is checked,
-        since messages write NaN or -1 for "unknown".
+        because messages write NaN or -1 for "unknown".
 
     Notes
     -----
-    A transform rotates both sides, S -> diag(R, R) S diag(R, R)^T, as tf2_geometry_msgs does: the error is that of the
-    pose's own origin, so no lever arm couples its halves, and the transform has no error of its own. NaN stays in its
-    3x3 block. A -1 for "unknown" is rotated like any number: check for it before.
+    A transform rotates both sides, S -> diag(R, R) S diag(R, R)^T, as tf2_geometry_msgs does. The covariance is about
+    the pose's own origin, so no lever arm couples translation and rotation, and the transform adds no error of its own.
+    NaN stays in its 3x3 block. A -1 for "unknown" is rotated like any number: check for it before.
     """
 
     frame: str
@@ -85,8 +85,8 @@ class TwistStamped(PlainData):
     with R and t of target_from_source, angular' = R angular and linear' = R linear + t x angular'. This is the
     adjoint map of Lynch and Park, "Modern Robotics", 2017, section 3.3.2, who write the angular part first.
 
-    Of the answers of `TransformTree.twist`, only one with ``expressed_in=frame`` is such a twist. Any other, as by
-    default, has the velocity of the origin of `frame` along the axes of `reference` or a third frame: do not move it.
+    An answer of `TransformTree.twist` is such a twist only with ``expressed_in=frame``. By default, or with another
+    frame, it has the velocity of the origin of `frame` along the axes of that other frame: do not transform it.
     """
 
     frame: str

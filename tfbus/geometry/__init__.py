@@ -1,8 +1,7 @@
 """Rigid transforms, samples that carry frames and a stamp, and arrays of transforms.
 
-`rows` has the arithmetic on plain tuples, and `transform` the value that users hold. `stamped` adds two frames, a stamp
-and an authority; `transform_array` holds many transforms at once; `read_only` protects the arrays of immutable values.
-`which_kernel` says whether the compiled kernel runs, which makes the base of a sample, or Python in its place.
+`transform` has the value that users hold. `stamped` adds two frames, a stamp and an authority; `transform_array` holds
+many transforms at once, and protects the arrays of immutable values.
 """
 
 from tfbus.geometry.stamped import TransformStamped

@@ -22,7 +22,7 @@ Fields = tuple[str, str, int, Row, str, bool]
 _KINDS = {"parent": str, "child": str, "stamp": int, "transform": Transform, "authority": str, "static": bool}
 
 _NO_BEGINNING = ("", "/")
-"""The first characters of strings that are no frame names."""
+"""The first characters of strings that are not frame names."""
 
 
 class TransformStamped(Sample):
@@ -68,7 +68,7 @@ class TransformStamped(Sample):
             and STAMP_MIN <= stamp <= STAMP_MAX
             and type(transform) is Transform
         ):
-            # Nearly always so. Below are the same checks with their errors, which take three times as long.
+            # The usual case. The same checks with their errors, below, take three times as long.
             self._fields = parent, child, stamp, transform._row, authority, bool(static)
             return
         for name in (parent, child):
@@ -95,7 +95,7 @@ class TransformStamped(Sample):
 
     @property
     def frame(self) -> str:
-        """The frame in which the pose of `child` is expressed: `parent`, as other stamped data call it."""
+        """The frame in which the pose of `child` is expressed: the same as `parent`, as in other stamped data."""
         return self.parent
 
     @property
@@ -141,7 +141,7 @@ class TransformStamped(Sample):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "TransformStamped":
-        """The sample or answer that `to_dict` made `data` of.
+        """The sample or answer from which `to_dict` made `data`.
 
         Raises
         ------
@@ -153,7 +153,7 @@ class TransformStamped(Sample):
         policy_use = fields.pop("extrapolated_by", None), fields.pop("gap", None)
         target, source = fields["parent"], fields["child"]
         if target == source:
-            # The answer of a lookup may be of one frame in itself; a sample may not.
+            # The answer of a lookup may have the same frame twice; a sample may not.
             fields["child"] = f"{target}'"
         answer = renamed(TransformStamped(**fields), target, source)
         if None in policy_use:
@@ -197,15 +197,15 @@ class QualifiedTransform(TransformStamped):
         return self._policy_use[1]
 
     def to_dict(self) -> dict[str, Any]:
-        """As that of a `TransformStamped`, with ``"extrapolated_by"`` and ``"gap"`` in ns."""
+        """As `TransformStamped.to_dict`, with ``"extrapolated_by"`` and ``"gap"`` in ns."""
         return {**super().to_dict(), "extrapolated_by": self.extrapolated_by, "gap": self.gap}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (type(self), self._fields, self._policy_use), getattr(self, "__dict__", None)
 
     def __str__(self) -> str:
-        held = f", extrapolated by {format_duration(self.extrapolated_by)}" if self.extrapolated_by else ""
-        return super().__str__() + held
+        remark = f", extrapolated by {format_duration(self.extrapolated_by)}" if self.extrapolated_by else ""
+        return super().__str__() + remark
 
 
 def answer_of(target: str, source: str, stamp: int, row: Row, static: bool) -> TransformStamped:
@@ -291,7 +291,7 @@ def as_max_translation(bound: float) -> float:
 
 def is_within(sample: TransformStamped, bound: float) -> bool:
     """Whether the translation of a sample is finite, and no longer than `bound` in m."""
-    # The square is quicker to have, and only near the bound may it be on the other side than the magnitude.
+    # The square is faster; it can disagree with the magnitude only near the bound.
     return sample._square < 0.99 * bound * bound or math.hypot(*sample._row[:3]) <= bound
 
 
@@ -305,7 +305,7 @@ def check_translations(batch: Batch, bound: float) -> None:
 def not_physical(sample: TransformStamped, bound: float) -> InvalidTransformError:
     """The error of a sample that is not within the bound, in m.
 
-    Its reason is ``"not physical"``; or ``"not finite"``, which the product of two transforms may be.
+    Its reason is ``"not physical"``; or ``"not finite"``, because the product of two transforms may be infinite.
     """
     parent, child, _, row, authority, _ = sample._fields
     length = math.hypot(*row[:3])

@@ -70,8 +70,8 @@ class Transform:
             x, y, z = translation
             i, j, k, w = rotation
             if type(x) is type(y) is type(z) is type(i) is type(j) is type(k) is type(w) is float:
-                # Nearly always so. `as_vector` and `as_rotation` check the same, and take eight times as long.
-                # Zero times a float is zero unless it is infinite or NaN, which takes no call to find out.
+                # The usual case. `as_vector` and `as_rotation` check the same, and take eight times as long.
+                # Zero times a float is zero unless the float is infinite or NaN; this check needs no call.
                 error = i * i + j * j + k * k + w * w - 1.0
                 if -ROUNDING <= error <= ROUNDING and 0.0 * x + 0.0 * y + 0.0 * z == 0.0:
                     self._row = x, y, z, i, j, k, w
@@ -93,8 +93,8 @@ class Transform:
     def from_matrix(cls, matrix: npt.ArrayLike) -> "Transform":
         """From a homogeneous matrix of shape (4, 4).
 
-        A rotation part within 1 % of a rotation is projected on the nearest one (Bar-Itzhack 2000, as done by
-        transforms3d).
+        If the rotation part is within 1 % of a rotation, it is projected on the nearest rotation (Bar-Itzhack 2000, as
+        transforms3d does it).
 
         Raises
         ------
@@ -146,7 +146,7 @@ class Transform:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "Transform":
-        """The transform that `to_dict` made `data` of; `ValueError` if they are none."""
+        """The transform from which `to_dict` made `data`; `ValueError` if the data are not a transform."""
         return cls(**from_fields(cls, data, {"translation": Vector, "rotation": Quaternion}))
 
     @property

@@ -19,7 +19,7 @@ from tfbus.stamps import StampsLike, as_array, as_stamps, format_stamp
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """A read-only view of an array that its owner may still write to; a read-only array is returned as it is."""
+    """A read-only view of an array that its owner may still write to; a read-only array is returned itself."""
     if not array.flags.writeable:
         return array
     view = array.view()
@@ -28,7 +28,7 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def locked(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """An array of numbers that nobody can make writable again, nor any view of it; the caller gives up the original.
+    """An array of numbers; nobody can make it or a view of it writable again. The caller gives up the original.
 
     Clearing the array's own ``writeable`` flag is not enough: the owner of the memory can set it again.
     """
@@ -180,7 +180,7 @@ class TransformArray:
     def as_rpy(self) -> Floats:
         """Roll, pitch, yaw of each in rad, as `Transform.as_rpy` gives them: a new array of shape (n, 3)."""
         x, y, z, w = self._columns[3:]
-        # Their squares add up to two, so that at most one of them is near zero.
+        # Their squares add up to two, so at most one of them is near zero.
         low, high = np.hypot(x + z, w - y), np.hypot(x - z, w + y)
         half_sum, half_difference = np.arctan2(x + z, w - y), np.arctan2(x - z, w + y)
         half_sum = np.where(low <= ROUNDING, half_difference, half_sum)
@@ -198,7 +198,7 @@ class TransformArray:
         ImportError
             If scipy is not installed.
         ValueError
-            If a transform is NaN: select the valid ones before.
+            If a transform is NaN: select the valid ones first.
         """
         from scipy.spatial.transform import Rotation
 
@@ -222,7 +222,7 @@ class TransformArray:
         ImportError
             If the library is not installed.
         ValueError
-            If it is another one.
+            If it is another library.
         """
         if library not in ("pandas", "polars"):
             raise ValueError(f"library must be 'pandas' or 'polars', not {library!r}")
@@ -242,7 +242,7 @@ class TransformArray:
         return matrices
 
     def apply(self, points: npt.ArrayLike) -> npt.NDArray[Any]:
-        """Each point by its own transform.
+        """Map each point by its own transform.
 
         Parameters
         ----------
@@ -274,7 +274,7 @@ class TransformArray:
     def __matmul__(self, other: "TransformArray | Transform") -> "TransformArray":
         """Compose with `other` one by one, or all with the same transform, without `extrapolated_by` and `gap`.
 
-        The product has the stamps of the operand that has some; None if both have stamps that differ.
+        If only one operand has stamps, the product has them. If both have stamps that differ, it has none.
         """
         columns = _columns_of(other, len(self))
         if columns is None:
@@ -361,7 +361,7 @@ def from_columns(columns: Floats, policy_use: Integers | None = None, stamps: In
 
 
 def with_stamps(transforms: TransformArray, stamps: Integers) -> TransformArray:
-    """Give a copy of these stamps, in ns, one for each, to transforms that nobody else has seen yet."""
+    """Give new transforms, which nobody else has seen yet, a copy of their stamps in ns."""
     transforms._known_stamps = locked(stamps.copy())
     return transforms
 

@@ -10,8 +10,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Final
 
-from tfbus.links.carrier import SendReport
-from tfbus.links.hashes import hash_bytes
+from tfbus.links.endpoint import MAX_PEERS
 from tfbus.links.message import (
     Entry,
     Kind,
@@ -22,10 +21,9 @@ from tfbus.links.message import (
     size_of,
     write_message,
 )
-from tfbus.links.outbox import OutgoingBatch, RemovedFrame, Turn
-from tfbus.links.peers import MAX_PEERS
-from tfbus.links.replica import Claim, Replica
-from tfbus.links.wire import Wire
+from tfbus.links.relay import OutgoingBatch, RemovedFrame, Turn
+from tfbus.links.replica import Claim, Replica, hash_bytes
+from tfbus.links.seams import SendReport, Wire
 
 ALL: Final = "all"
 SLOW: Final = "slow"

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.carrier import Presence, Received
 from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
-from tfbus.links.endpoint import Endpoint
+from tfbus.links.endpoint import MAX_PEERS, Endpoint
 from tfbus.links.history import HistoryAsker, HistoryTeller
 from tfbus.links.lookups import Answers, RemoteLookups
 from tfbus.links.message import (
@@ -27,11 +26,19 @@ from tfbus.links.message import (
     write_message,
     write_text,
 )
-from tfbus.links.outbox import Outbox, OutgoingBatch, Rank, RemovedFrame, Turn
-from tfbus.links.peers import MAX_PEERS, Peer
-from tfbus.links.relay import Provenance, ReceivedBatch, ReceivedTransform
+from tfbus.links.relay import (
+    Outbox,
+    OutgoingBatch,
+    Peer,
+    Provenance,
+    Rank,
+    ReceivedBatch,
+    ReceivedTransform,
+    RemovedFrame,
+    Turn,
+)
 from tfbus.links.replica import CHUNK, Agreement, Claim, Entry, Places, Replica, TooManyEntriesError
-from tfbus.links.wire import Hearing, Joined, Left, Wire, WireItem
+from tfbus.links.seams import Hearing, Joined, Left, Presence, Received, Wire, WireItem
 from tfbus.tf_message import MalformedMessageError
 
 SIGN_PERIOD = 1.0
@@ -171,6 +178,8 @@ class DomainEnd(Endpoint):
         self.lookups = RemoteLookups(wire.send, wire.id, name)
         self._news: dict[str, bool] = {}
         self._thinned: dict[str, float] = {}
+        # The last sign of each peer of which nothing is wanted: the same sign once more need not wake the event loop.
+        self._resting: dict[str, bytes] = {}
         # Answers take half of the time of the event loop at most.
         self._questions: dict[tuple[str, Kind], bytes] = {}
         self._answers_due = -inf
@@ -208,7 +217,9 @@ class DomainEnd(Endpoint):
             self.handle(sender, _Due(kind, self._questions.pop((sender, kind))))
             after = self._now()
             now, self._answers_due = after, 2 * after - now
-        question = self._agreement.question(now)
+        is_due = now >= self._agreement.next_due()
+        is_behind = is_due and (self.host.is_behind() or self._wire.is_behind())
+        question = self._agreement.question(now, is_behind) if is_due else None
         if question is not None:
             frames = sorted(self.frames) if self.frames is not None and self._filters else None
             text = write_text(Kind.QUESTION, {"since": question.since, "frames": frames})
@@ -232,7 +243,16 @@ class DomainEnd(Endpoint):
         return due
 
     def split(self, item: Received) -> Iterator[Any]:
-        return read_message(item.content) if isinstance(item.content, bytes) else iter((item.content,))
+        if not isinstance(item.content, bytes):
+            return iter((item.content,))
+        return read_message(item.content) if item.moving or item.urgent else self._split_sign(item)
+
+    def _split_sign(self, item: Received) -> Iterator[Any]:
+        for part in read_message(item.content):
+            yield part
+            # Who tells the time may be followed later.
+            if isinstance(part, Heard) and part.time is None and self._agreement.rests(item.sender, self._now()):
+                self._resting[item.sender] = item.content
 
     def _warn_of_wire(self, error: Exception) -> None:
         self._log.warning(str(error), "the link %s: %s", self.name, error)
@@ -302,6 +322,8 @@ class DomainEnd(Endpoint):
         """Take an item of the wire, from any thread."""
         if isinstance(item, bytes):
             kind = kind_of(item)
+            if kind is Kind.SIGN and self._resting.get(link) == item:
+                return
             urgent = kind in _URGENT
             received = Received(link, item, len(item), kind is Kind.LIVE, urgent, kind in _FOLLOWS)
         elif isinstance(item, Left):
@@ -314,10 +336,11 @@ class DomainEnd(Endpoint):
         if isinstance(content, Joined):
             peer = self._join(sender, content.robot)
             if peer is not None:
+                peer.rate = self._rate_of(peer.robot)
                 self._meet(peer)
                 self._sign_sooner()
                 # Nothing is wanted of a robot of rate 0 but answers to lookups.
-                if self._rate_of(peer.robot):
+                if peer.rate:
                     # A peer hears of a filter by the first question.
                     self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
                     if self._history is not None:
@@ -365,7 +388,7 @@ class DomainEnd(Endpoint):
             self._update_ways(peer, heard)
             if heard.kind in (Kind.SIGN, Kind.MEETING):
                 self.lookups.note_server(sender, peer.robot, heard.serves)
-                if not self._rate_of(peer.robot):
+                if not peer.rate:
                     return
             if heard.kind is not Kind.SIGN:
                 self.messages += 1
@@ -376,8 +399,11 @@ class DomainEnd(Endpoint):
     def _take_held(self, peer: Peer, heard: Heard) -> None:
         now = self._now()
         live = heard.kind is Kind.LIVE
+        if not live:
+            self._resting.pop(peer.id, None)
         if not heard.continues and (live or heard.kind is Kind.SIGN) and self._count_gap(peer, heard.number, live):
             self._agreement.missed(peer.id, now)
+            self._resting.pop(peer.id, None)
             self.host.stir()
         if heard.kind is Kind.PAST:
             self._take_past(peer, heard)
@@ -433,9 +459,9 @@ class DomainEnd(Endpoint):
         self, replica: Replica, provenance: Provenance, samples: list[ReceivedTransform], live: bool
     ) -> list[ReceivedTransform]:
         """Note the samples of a batch; returns those that are to be published if they are news."""
-        samples = [sample for sample in samples if self._is_wanted(sample)]
+        samples = self._wanted(samples)
         rank, peer = provenance.rank, provenance.peer
-        if provenance.origin == self.relay.origin:
+        if provenance.origin == self.relay.origin or (live and replica.note_moving(samples, rank)):
             return samples
         kept: list[ReceivedTransform] = []
         for sample in samples:
@@ -446,13 +472,21 @@ class DomainEnd(Endpoint):
                 assert peer is not None
                 self.peers.reject(peer.id, "too many frames", error)
                 continue
-            # Of a moving frame, every live sample counts; the relay knows which of them have come before.
-            if is_new or (live and not static and _moves(replica.entries[child])):
+            if is_new or (live and not static and self._may_be_news(replica.entries[child], provenance.origin)):
                 kept.append(sample)
         return kept
 
-    def _is_wanted(self, sample: ReceivedTransform) -> bool:
-        return self.frames is None or sample._fields[1] in self.frames
+    def _may_be_news(self, entry: Entry, origin: bytes) -> bool:
+        """Whether a live sample that moves a frame, and is not the newest of it, may be one that has not come before.
+
+        Every such sample counts. The relay knows which have come before, but for those of a lost bus, which it forgets.
+        """
+        moves = entry.sample is not None and not entry.sample.static
+        return moves and (entry.origin == origin or self.relay.reaches(origin))
+
+    def _wanted(self, samples: list[ReceivedTransform]) -> list[ReceivedTransform]:
+        frames = self.frames
+        return samples if frames is None else [sample for sample in samples if sample._fields[1] in frames]
 
     def _take_removal(self, peer: Peer, replica: Replica, removal: RemovedFrame) -> bool:
         if self.frames is not None and removal.frame not in self.frames:
@@ -515,14 +549,13 @@ class DomainEnd(Endpoint):
 
     def _is_thinned(self, peer: Peer, heard: Heard) -> bool:
         """Whether a message with newest samples comes before its time."""
-        rate = self._rate_of(peer.robot)
-        if heard.number or rate == inf:
+        if heard.number or peer.rate == inf:
             return False
         now = self._now()
         since = now - self._thinned.get(peer.id, -inf)
         # Samples that belong together come in several messages at once.
         if since > 0.02:
-            if since < 0.9 / rate:
+            if since < 0.9 / peer.rate:
                 return True
             self._thinned[peer.id] = now
         return False
@@ -553,6 +586,7 @@ class DomainEnd(Endpoint):
         self._agreement.left(peer.id)
         self.lookups.left(peer.id)
         self._news.pop(peer.id, None)
+        self._resting.pop(peer.id, None)
         self._thinned.pop(peer.id, None)
         self._forget_robots(peer.robot)
         lost = {bus for bus in peer.paths if self.relay.way_closed(bus)}
@@ -641,8 +675,8 @@ class DomainEnd(Endpoint):
             for entry in heard.entries:
                 if isinstance(entry, ReceivedBatch) and self._admit_number(peer, entry.sequence, len(entry.samples)):
                     assert entry.origin is not None
-                    samples = [sample for sample in entry.samples if self._is_wanted(sample)]
-                    batches.append((Provenance(entry.origin, entry.sequence, self.outbox, peer), samples))
+                    source = Provenance(entry.origin, entry.sequence, self.outbox, peer)
+                    batches.append((source, self._wanted(entry.samples)))
             self._publish(peer, batches, live=False, past=True)
             goes_on = goes_on or self._history.goes_on(peer.id, heard)
         finally:
@@ -698,7 +732,3 @@ class _Due(NamedTuple):
 
     kind: Kind
     data: bytes
-
-
-def _moves(entry: Entry) -> bool:
-    return entry.sample is not None and not entry.sample.static

@@ -5,20 +5,132 @@ tfbus, over a wire. Nothing that a peer sends makes either of them raise.
 """
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator
 from copy import copy
 from math import inf
 from typing import Any, Protocol
 
 from tfbus.bus.bus import Bus
-from tfbus.bus.subscribers import OnceLogger
+from tfbus.bus.subscribers import OnceLogger, SeenKeys
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
-from tfbus.links.carrier import Carrier, Presence, Received, SendReport, SplittingCarrier
-from tfbus.links.clock_follower import HearsTime
-from tfbus.links.outbox import LatchingOutbox, Outbox, Turn
-from tfbus.links.peers import Peer, Peers
-from tfbus.links.relay import relay_of
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links.relay import REMEMBERED_REASONS, Outbox, OutgoingBatch, Peer, Rank, Turn, relay_of
+from tfbus.links.seams import Carrier, Presence, Received, SendReport, SplittingCarrier
 from tfbus.tf_message import MalformedMessageError
+
+MAX_PEERS = 1_000
+MAX_AUTHORITIES = 1_000
+MOST_AUTHORITY_TEXT = 2**20
+"""Letters of all authorities of one peer together."""
+
+
+class Peers:
+    """All peers of one link.
+
+    Parameters
+    ----------
+    report : callable
+        Called with a peer's id, a reason and an error, once for each peer and reason.
+
+    Attributes
+    ----------
+    rejected : Counter
+        How many messages and samples were refused, by reason.
+    """
+
+    def __init__(self, report: Callable[[str, str, Exception], object]) -> None:
+        self._report = report
+        self._peers: dict[str, Peer] = {}
+        self._reported_of_unknown = SeenKeys(REMEMBERED_REASONS)
+        self.rejected: Counter[str] = Counter()
+
+    def __iter__(self) -> Iterator[Peer]:
+        return iter(self._peers.values())
+
+    def __len__(self) -> int:
+        """The number of peers that are known, present or not."""
+        return len(self._peers)
+
+    @property
+    def present(self) -> tuple[str, ...]:
+        """The ids of the peers that have announced themselves, sorted."""
+        return tuple(sorted(peer.id for peer in self._peers.values() if peer.present))
+
+    def find(self, id: str) -> Peer | None:  # noqa: A002
+        """The peer of an id, known or new; None if it is new and there are too many."""
+        peer = self._peers.get(id)
+        if peer is None:
+            if len(self._peers) >= MAX_PEERS:
+                self.reject(id, "too many peers", ValueError(f"more than {MAX_PEERS} peers on one link"))
+                return None
+            peer = self._peers[id] = Peer(id)
+        return peer
+
+    def get(self, id: str) -> Peer | None:  # noqa: A002
+        """The peer of an id, if it is known."""
+        return self._peers.get(id)
+
+    def join(self, id: str) -> tuple[Peer | None, Peer | None]:  # noqa: A002
+        """Note that a peer is there.
+
+        Returns
+        -------
+        peer : Peer or None
+            None if it was present before, or there is no place.
+        evicted : Peer or None
+            A peer that has never announced itself, and had to make room.
+        """
+        evicted = None
+        if id not in self._peers and len(self._peers) >= MAX_PEERS:
+            evicted = next((peer for peer in self._peers.values() if not peer.present), None)
+            if evicted is not None:
+                del self._peers[evicted.id]
+        peer = self.find(id)
+        if peer is None or peer.present:
+            return None, evicted
+        peer.present = True
+        return peer, evicted
+
+    def forget(self, id: str) -> Peer | None:  # noqa: A002
+        """Remove a peer that has gone; returns it if it was known."""
+        return self._peers.pop(id, None)
+
+    def forget_all(self) -> list[Peer]:
+        """Remove all peers, and return them."""
+        peers = list(self._peers.values())
+        self._peers.clear()
+        return peers
+
+    def reject(self, id: str, reason: str, error: Exception, count: int = 1) -> None:  # noqa: A002
+        """Count what was refused of a peer, and report the first refusal for each reason."""
+        self.rejected[reason] += count
+        peer = self._peers.get(id)
+        reported = self._reported_of_unknown if peer is None else peer.reported
+        if reported.add(reason):
+            self._report(id, reason, error)
+
+    def admit_authorities(self, peer: Peer, authorities: Collection[str], samples: int) -> bool:
+        """Note the authorities that a batch names; returns False, and refuses the batch, if they are too many."""
+        for authority in authorities:
+            if authority not in peer.authorities:
+                text = peer.authority_text + len(authority)
+                if len(peer.authorities) >= MAX_AUTHORITIES or text > MOST_AUTHORITY_TEXT:
+                    error = ValueError(
+                        f"the peer has spoken for more than {MAX_AUTHORITIES} authorities, or for very long ones"
+                    )
+                    self.reject(peer.id, "too many authorities", error, samples)
+                    return False
+                peer.authorities.add(authority)
+                peer.authority_text = text
+        return True
+
+
+class HearsTime(Protocol):
+    """A follower of the time of another program."""
+
+    def hear(self, stamp: int) -> None:
+        """Take the time of the other program, a stamp in ns."""
 
 
 class Host(Protocol):
@@ -29,6 +141,9 @@ class Host(Protocol):
 
     def send_soon(self, pending: int) -> None:
         """Have `Endpoint.send` called at the end of the turn of the event loop; so many samples wait."""
+
+    def is_behind(self) -> bool:
+        """Whether items wait to be handled."""
 
     def stir(self) -> None:
         """Have `Endpoint.work` called before the time that it has returned."""
@@ -228,6 +343,44 @@ class Endpoint:
 
     def _notify(self) -> None:
         self.host.send_soon(self.outbox.pending)
+
+
+class LatchingOutbox(Outbox):
+    """The outbox of a link to a world that keeps messages with static frames for late joiners, as ROS does.
+
+    Of frames that this link has sent before, an echo replaces what is kept, for now another link brings them.
+    """
+
+    def __init__(self, frames: Collection[str] | None, notify: Callable[[], object]) -> None:
+        super().__init__(frames, notify)
+        self._kept: set[str] = set()
+        self._changes: dict[str, TransformStamped | None] = {}
+
+    def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
+        changed = False
+        for sample in batch.samples:
+            _, child, _, _, _, static = sample._fields
+            if static and (not echo or child in self._kept):
+                self._kept.add(child)
+                self._changes[child] = sample
+                changed = True
+            elif not static and child in self._kept:
+                self._kept.remove(child)
+                self._changes[child] = None
+                changed = True
+        return changed
+
+    def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
+        del rank
+        if frame not in self._kept:
+            return False
+        self._kept.remove(frame)
+        self._changes[frame] = None
+        return True
+
+    def _take_statics(self) -> dict[str, TransformStamped | None]:
+        changes, self._changes = self._changes, {}
+        return changes
 
 
 class ForeignEnd(Endpoint):

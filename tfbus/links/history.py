@@ -13,8 +13,7 @@ from math import inf
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.message import Heard
-from tfbus.links.outbox import OutgoingBatch
-from tfbus.links.relay import ReceivedBatch, Relay
+from tfbus.links.relay import OutgoingBatch, ReceivedBatch, Relay
 from tfbus.links.replica import Replica
 from tfbus.stamps import from_seconds
 from tfbus.tree.history import FrameHistory

@@ -2,10 +2,12 @@
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import threading
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
 from time import monotonic
 from types import TracebackType
-from typing import Any, Self, TypedDict
+from typing import Any, Final, Self, TypedDict
 
 import anyio
 import anyio.abc
@@ -18,23 +20,171 @@ from tfbus.bus.queues import check_capacity
 from tfbus.clock import SimulatedClock
 from tfbus.errors import BusClosedError
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.carrier import Received, ReceiveQueue
-from tfbus.links.clock_follower import ClockFollower, HearsTime
 from tfbus.links.domain import DomainEnd
-from tfbus.links.endpoint import Endpoint
+from tfbus.links.endpoint import Endpoint, HearsTime
 from tfbus.links.history import LONGEST_HISTORY
 from tfbus.links.lookups import Answers, RemoteLookups
-from tfbus.links.remote_lookup import RemoteQuestion
-from tfbus.links.wire import Wire
+from tfbus.links.message import RemoteQuestion
+from tfbus.links.seams import Presence, Received, Wire
 from tfbus.registration import Registration, warn_unless_entered
-from tfbus.stamps import LATEST, Latest, as_duration, as_stamp
-from tfbus.statistics import LinkStatistics
+from tfbus.stamps import LATEST, Latest, as_duration, as_stamp, from_seconds, to_seconds
+from tfbus.statistics import LinkStatistics, QueueStatistics
 from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.lookup import Hold, policy_of
 
 _LONGEST_NAME = 200
 _FULL_TURN = 5_000
 """So many samples and removals are sent at once, before the turn of the event loop ends."""
+MANY = 100
+"""Moving items that wait, beyond which an answer overtakes those of its own sender too."""
+_MAX_BYTES = 64 * 2**20
+_OVERHEAD = 256
+"""Bytes that an item takes besides its content."""
+FAR: Final = 10.0
+"""s; a time that is further ahead is a jump, because to run all timers up to it would take long."""
+
+
+class ReceiveQueue:
+    """Holds what threads have received until the event loop reads it.
+
+    Items are read in order, but urgent ones, which bring two ends to agree, are read first: where nobody has time, the
+    others may wait for seconds. All that waits of a peer is read before its end, for it was sent before that, and
+    before its answer, which would else split batches. Only while more than `MANY` moving items wait, the answer does
+    not wait for them.
+
+    Parameters
+    ----------
+    capacity : int
+        How many moving items may be pending, within 64 MiB for all items together; beyond that the oldest moving items
+        are dropped, and when there are none, the oldest of the others. What is to be read first is dropped last.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._lock = threading.Lock()
+        self._urgent: deque[Received] = deque()
+        # Items that do not move and were passed over in a search for the oldest moving one.
+        self._kept: deque[Received] = deque()
+        self._pending: deque[Received] = deque()
+        self._bytes = 0
+        self._moving = 0
+        self._dropped = 0
+
+    def __len__(self) -> int:
+        return len(self._urgent) + len(self._kept) + len(self._pending)
+
+    def put(self, item: Received) -> None:
+        """Append an item, from any thread."""
+        with self._lock:
+            if item.urgent:
+                if item.content is Presence.LEFT or (item.follows and self._moving <= MANY):
+                    self._hurry(item.sender)
+                self._urgent.append(item)
+            else:
+                self._pending.append(item)
+            self._bytes += _footprint(item)
+            self._moving += item.moving
+            while self._moving > self._capacity or self._bytes > _MAX_BYTES:
+                self._drop_oldest()
+
+    def get(self) -> Received | None:
+        """Remove and return the oldest item; None if the queue is empty."""
+        with self._lock:
+            for queue in (self._urgent, self._kept, self._pending):
+                if queue:
+                    return self._pop(queue)
+        return None
+
+    def discard_moving(self) -> None:
+        """Drop all moving items, because the clock has jumped back."""
+        with self._lock:
+            for queue in (self._urgent, self._kept, self._pending):
+                kept = [item for item in queue if not item.moving]
+                queue.clear()
+                queue.extend(kept)
+            self._dropped += self._moving
+            self._bytes = sum(map(_footprint, (*self._urgent, *self._kept, *self._pending)))
+            self._moving = 0
+
+    def statistics(self) -> QueueStatistics:
+        """The queue's counters, in items."""
+        with self._lock:
+            return QueueStatistics("link", "drop_oldest", self._capacity, len(self), self._dropped)
+
+    def _drop_oldest(self) -> None:
+        while self._pending and not self._pending[0].moving:
+            self._kept.append(self._pending.popleft())
+        if self._moving and not self._pending:
+            self._pop(self._urgent, next(place for place, item in enumerate(self._urgent) if item.moving))
+        else:
+            self._pop(self._pending or self._kept or self._urgent)
+        self._dropped += 1
+
+    def _pop(self, queue: deque[Received], place: int = 0) -> Received:
+        item = queue[place]
+        del queue[place]
+        self._bytes -= _footprint(item)
+        self._moving -= item.moving
+        return item
+
+    def _hurry(self, sender: str) -> None:
+        """Have all that waits of a peer read before what waits of others."""
+        for queue in (self._kept, self._pending):
+            waiting = list(queue)
+            queue.clear()
+            for item in waiting:
+                (self._urgent if item.sender == sender else queue).append(item)
+
+
+def _footprint(item: Received) -> int:
+    return item.size + _OVERHEAD
+
+
+class ClockFollower:
+    """Drives a `SimulatedClock` by the stamps that are heard; nothing is polled.
+
+    The clock jumps to the first stamp, to one before the last, and to one that is more than `FAR` ahead. To all others
+    it advances, so that timed tasks run in their order. Nobody else may advance the clock.
+
+    Parameters
+    ----------
+    clock : SimulatedClock
+    """
+
+    def __init__(self, clock: SimulatedClock) -> None:
+        self.clock = clock
+        self._newest: int | None = None
+        self._heard: anyio.Event | None = None
+        self._advancing: anyio.CancelScope | None = None
+
+    def hear(self, stamp: int) -> None:
+        """Take the time of the other program, a stamp in ns; a jump is done when this returns."""
+        before, self._newest = self._newest, stamp
+        if before is None or stamp < before or stamp - before > from_seconds(FAR):
+            if self._advancing is not None:
+                self._advancing.cancel()
+            if stamp != self.clock.now():
+                self.clock.set(stamp)
+        elif self._heard is not None:
+            self._heard.set()
+
+    async def run(self) -> None:
+        """Advance the clock to what is heard, until cancelled.
+
+        Raises
+        ------
+        RuntimeError
+            If another task advances the clock.
+        """
+        while True:
+            ahead = 0 if self._newest is None else self._newest - self.clock.now()
+            if ahead > 0:
+                with anyio.CancelScope() as self._advancing:
+                    await self.clock.advance(to_seconds(ahead))
+                self._advancing = None
+            else:
+                self._heard = anyio.Event()
+                await self._heard.wait()
 
 
 class Link:
@@ -54,8 +204,8 @@ class Link:
         time is followed until it is lost; the time of others is refused and counted.
     tell_clock : bool
         Whether to tell peers the time of the bus's clock, which is a `SimulatedClock`.
-    now : callable, optional
-        The monotonic clock, in s, by which a turn ends.
+    budget : TurnBudget, optional
+        The time for which received items keep the event loop.
 
     Attributes
     ----------
@@ -82,7 +232,7 @@ class Link:
         capacity: int = 10_000,
         clock: SimulatedClock | HearsTime | None = None,
         tell_clock: bool = False,
-        now: Callable[[], float] = monotonic,
+        budget: TurnBudget | None = None,
     ) -> None:
         bus = end.bus
         if tell_clock and not isinstance(bus.clock, SimulatedClock):
@@ -101,7 +251,7 @@ class Link:
         # The item that is being handled, and the rest of its parts.
         self._whole: Received | None = None
         self._parts: Iterator[Any] = iter(())
-        self._budget = TurnBudget(now=now)
+        self._budget = TurnBudget() if budget is None else budget
         self._received = LoopWaker(self._handle_received)
         self._turn_ends = LoopWaker(end.send)
         self._entered = False
@@ -200,8 +350,16 @@ class Link:
         """Send what has gathered at the end of this turn of the event loop. Called by the end."""
         if pending >= _FULL_TURN:
             self._end.send()
-        else:
+            return
+        try:
             self._turn_ends.wake()
+        except RuntimeError as error:
+            problem = "the event loop in which it was entered has ended, and not the link"
+            raise RuntimeError(f"{self!r} sends nothing any more: {problem}") from error
+
+    def is_behind(self) -> bool:
+        """Whether items wait to be handled. Called by the end."""
+        return self._whole is not None or len(self._receive_queue) > 0
 
     def stir(self) -> None:
         """Look again what is due. Called by the end."""
@@ -216,6 +374,10 @@ class Link:
                 await self._stirred.wait()
 
     def _handle_received(self) -> None:
+        # The first item takes many times as long as the next ones where other processes have used the caches since the
+        # last turn; with the budget spent on it alone, a crowded machine would never be done.
+        if not (self._attached and self._handle_part()):
+            return
         self._budget.begin()
         while self._attached and self._handle_part():
             if self._budget.spent:

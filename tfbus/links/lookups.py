@@ -2,7 +2,7 @@
 
 A question goes to one peer of the robot that serves a buffer; its signs of life say so. It waits there as any lookup
 of that buffer does, for `LONGEST_WAIT` at most; then the asker is told what is missing, and asks again if it still
-wants to know. One that is given up is cancelled there. What comes from strangers passes `tfbus.links.remote_lookup`.
+wants to know. One that is given up is cancelled there. What comes from strangers passes `tfbus.links.message`.
 """
 
 import logging
@@ -22,14 +22,15 @@ from tfbus.bus.queues import check_capacity
 from tfbus.bus.subscribers import OnceLogger
 from tfbus.errors import MAY_COME, LookupTimeoutError, RemoteLookupError, TransformError, TransformLookupError
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.message import Kind, write_body
-from tfbus.links.remote_lookup import (
+from tfbus.links.message import (
     Cancellation,
+    Kind,
     RemoteQuestion,
     as_timeout,
     read_answer,
     read_question,
     write_answer,
+    write_body,
     write_question,
 )
 from tfbus.registration import warn_unless_entered
@@ -170,28 +171,28 @@ class RemoteLookups:
 
     async def ask(self, question: RemoteQuestion, robot: str | None, limit: float) -> TransformStamped:
         """Ask a link of a robot that serves a buffer, until there is an answer; the errors are those of `lookup`."""
-        until = monotonic() + limit
+        until = anyio.current_time() + limit
         silences = 0
         while True:
             server = await self._find_server(robot, until)
-            left = max(until - monotonic(), 0.0)
+            left = max(until - anyio.current_time(), 0.0)
             try:
                 return await self._ask(server, question, robot, min(left, LONGEST_WAIT))
             except RemoteLookupError as error:
                 # A congested network drops questions and answers.
                 silences += 1
-                if error.reason != "silent" or silences > _MOST_SILENCES or monotonic() >= until:
+                if error.reason != "silent" or silences > _MOST_SILENCES or anyio.current_time() >= until:
                     raise
             except LookupTimeoutError as error:
                 missing = error.__cause__
-                if monotonic() >= until or left <= LONGEST_WAIT:
+                if anyio.current_time() >= until or left <= LONGEST_WAIT:
                     if not isinstance(missing, TransformLookupError):
                         missing = error
                     target, source = question.target, question.source
                     raise LookupTimeoutError(target=target, source=source, timeout=limit, missing=missing) from missing
 
     async def _find_server(self, robot: str | None, until: float) -> str:
-        with anyio.move_on_after(min(PATIENCE, max(until - monotonic(), 0.0))):
+        with anyio.move_on_after(min(PATIENCE, max(until - anyio.current_time(), 0.0))):
             while self._is_open and self._server_of(robot) is None:
                 await self._changed.wait()
         if not self._is_open:

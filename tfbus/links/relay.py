@@ -14,22 +14,25 @@ Batches of a world that has no origins, such as ROS, get this bus as their origi
 sent, by another link of this bus or by another bus, and nothing in it tells. So while a link to such a world is
 attached, the relay remembers the newest samples of each child, and takes the same one for news only once.
 
+What goes out gathers in the outbox of each link until the turn of the event loop ends.
+
 The relay also counts the ways to each bus, its *reach*: a link with `drop_lost` withdraws the frames of a bus that no
 way leads to any more. They are not removed: see `tfbus.links.replica`.
 """
 
 import os
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import groupby
+from math import inf
 from time import time_ns
 from typing import Any
 
 from tfbus.bus.bus import Bus
+from tfbus.bus.subscribers import SeenKeys
 from tfbus.errors import UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.links.outbox import LOWEST, Outbox, OutgoingBatch, Rank, RemovedFrame
-from tfbus.links.peers import Peer
 from tfbus.registration import Registration
 from tfbus.rows import Row
 
@@ -43,6 +46,214 @@ _LEAP = 2**16
 _REMEMBERED = 10_000
 _PER_CHILD = 256
 _GONE_CHILDREN = 1_000
+REMEMBERED_REASONS = 100
+
+Rank = tuple[int, bytes]
+"""Number and origin. Of two things that are said of one frame, the one of the higher rank holds."""
+LOWEST: Rank = (-1, b"")
+
+
+class OutgoingBatch:
+    """Samples of one batch and one origin, as they go out.
+
+    Attributes
+    ----------
+    origin : bytes
+        The bus on which the batch was published first, 16 bytes.
+    sequence : int
+        The batch's number on that bus.
+    samples : sequence of TransformStamped
+    """
+
+    __slots__ = ("origin", "samples", "sequence")
+
+    def __init__(self, origin: bytes, sequence: int, samples: Sequence[TransformStamped]) -> None:
+        self.origin = origin
+        self.sequence = sequence
+        self.samples = samples
+
+
+@dataclass(frozen=True, slots=True)
+class RemovedFrame:
+    """A frame was removed, by the batch number `sequence` of the bus `origin`."""
+
+    origin: bytes
+    sequence: int
+    frame: str
+
+
+@dataclass(slots=True)
+class Turn:
+    """All that one turn of the event loop has published and removed.
+
+    Attributes
+    ----------
+    entries : list of OutgoingBatch or RemovedFrame
+        In the order in which it happened.
+    statics : dict of str to TransformStamped or None
+        The static frames whose state for late joiners has changed, for networks that keep messages for these: the
+        newest sample of each, or None if the frame is not to be kept any more.
+    time : int or None
+        The time of the clock that the link tells, in ns, if it has to be told. A turn may have nothing else.
+    """
+
+    entries: list[OutgoingBatch | RemovedFrame]
+    statics: dict[str, TransformStamped | None]
+    time: int | None = None
+
+
+class Outbox:
+    """The sending half of a link.
+
+    Parameters
+    ----------
+    frames : collection of str or None
+        The children that may go out; None for all.
+    notify : callable
+        Called when something was added.
+
+    Attributes
+    ----------
+    pending : int
+        How many samples and removals wait to go out.
+    time : int or None
+        The time of the clock that was told last, in ns.
+    """
+
+    def __init__(self, frames: Collection[str] | None, notify: Callable[[], object]) -> None:
+        self._frames = frames
+        self._notify = notify
+        self._entries: list[OutgoingBatch | RemovedFrame] = []
+        self._time_waits = False
+        self.pending = 0
+        self.time: int | None = None
+
+    def add_batch(self, batch: OutgoingBatch, echo: bool = False) -> None:
+        """Add samples that were published; an echo, samples that came in by this very link, does not go out."""
+        if self._frames is not None:
+            wanted = tuple(sample for sample in batch.samples if sample.child in self._frames)
+            if not wanted:
+                return
+            batch = OutgoingBatch(batch.origin, batch.sequence, wanted)
+        if not echo:
+            self._entries.append(batch)
+            self.pending += len(batch.samples)
+        if self._follow(batch, echo) or not echo:
+            self._notify()
+
+    def add_removal(self, removal: RemovedFrame, echo: bool = False, withdrawn: bool = False) -> None:
+        """Add the removal of a frame; it goes out as batches do.
+
+        A frame is withdrawn rather than removed if it left this bus only because its owner was lost.
+        """
+        if self._frames is not None and removal.frame not in self._frames:
+            return
+        goes_out = not echo and not (withdrawn and self.keeps_withdrawn)
+        if goes_out:
+            self._entries.append(removal)
+            self.pending += 1
+        if self._follow_removal(removal.frame, (removal.sequence, removal.origin) if goes_out else None) or goes_out:
+            self._notify()
+
+    def tell_time(self, stamp: int) -> None:
+        """Tell the time of a clock, in ns, with what is sent next."""
+        self.time = stamp
+        self._time_waits = True
+        self._notify()
+
+    def flush(self) -> Turn:
+        """Remove and return all that has gathered."""
+        turn = Turn(self._entries, self._take_statics(), self.time if self._time_waits else None)
+        self._time_waits = False
+        self._entries, self.pending = [], 0
+        return turn
+
+    keeps_withdrawn = False
+    """Whether the other ends see for themselves that the owner of a frame was lost."""
+
+    def keep(self, entry: OutgoingBatch | RemovedFrame) -> None:
+        """Note what another link knows and is not, or no more, on this bus, for whoever shows it."""
+
+    def kept(self) -> Iterable[OutgoingBatch | RemovedFrame]:
+        """All that is known by this link, for another one that begins later."""
+        return ()
+
+    def own_sample(self, _frame: str, /) -> TransformStamped | None:
+        """The newest sample of a frame that this bus has to say again if somebody has outnumbered it."""
+        return None
+
+    def ways(self) -> Iterable[tuple[bytes, tuple[bytes, ...]]]:
+        """The buses that the peers of this link lead to, each with the buses on the way there."""
+        return ()
+
+    def reach_changed(self) -> None:
+        """The buses that this one reaches by other links have changed."""
+
+    def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
+        """Note the frames of a batch for late joiners; returns whether anything changes for these."""
+        raise NotImplementedError
+
+    def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
+        """Note for late joiners that a frame has gone; returns whether anything changes for these.
+
+        There is no rank if the other ends know it, because they have said so or see that its owner was lost.
+        """
+        raise NotImplementedError
+
+    def _take_statics(self) -> dict[str, TransformStamped | None]:
+        return {}
+
+
+class Peer:
+    """The other end of a link, as far as this end knows it.
+
+    Attributes
+    ----------
+    id : str
+    present : bool
+        Whether it has announced that it is there.
+    robot : str
+        The robot whose link it is; empty without one.
+    rate : float
+        How often its newest samples are wanted, in Hz; infinite for everything, 0 for nothing.
+    number : int
+        That of its newest live message; 0 before the first.
+    authorities : set of str
+        The authorities whose samples it has sent.
+    authority_text : int
+        The letters of these.
+    frames : set of str
+        The frames that it was the first to bring from a world without origins; their number is limited.
+    paths : dict of bytes to tuple of bytes
+        The buses that are reached through it, its own among them, each with the buses on the way there.
+    reported : SeenKeys
+        The reasons of refusals that were reported.
+    """
+
+    __slots__ = (
+        "authorities",
+        "authority_text",
+        "frames",
+        "id",
+        "number",
+        "paths",
+        "present",
+        "rate",
+        "reported",
+        "robot",
+    )
+
+    def __init__(self, id: str) -> None:  # noqa: A002 - the wire calls it so
+        self.id = id
+        self.present = False
+        self.robot = ""
+        self.rate = inf
+        self.number = 0
+        self.authorities: set[str] = set()
+        self.authority_text = 0
+        self.frames: set[str] = set()
+        self.paths: dict[bytes, tuple[bytes, ...]] = {}
+        self.reported = SeenKeys(REMEMBERED_REASONS)
 
 
 class Provenance:
@@ -390,12 +601,11 @@ class Relay:
         passed, foreign = self._passed, origin == self.origin
         settled, removed = self._settled, self._removed
         for sample in samples:
-            fields = sample._fields
-            child = fields[1]
+            child, static = sample.child, sample.static
             # A static one with an origin has to be ranked, so that all buses agree in the end.
-            if passed is not None and (foreign or not fields[5]) and sample in passed:
+            if passed is not None and (foreign or not static) and sample in passed:
                 continue
-            if (child in settled or child in removed or fields[5]) and self._is_outranked(sample, rank):
+            if (child in settled or child in removed or static) and self._is_outranked(sample, rank):
                 continue
             known = newest.get(child)
             if known is None:
@@ -414,7 +624,7 @@ class Relay:
             sample._provenance = provenance
             news.append(sample)
         for sample in news[before:] if before else news:
-            newest[sample._fields[1]] = sequence
+            newest[sample.child] = sequence
         if not newest:
             del self._newest[origin]
         return refused
@@ -435,12 +645,15 @@ class Relay:
                 provenance = Provenance(self.origin, self._next_number())
             samples = tuple(group)
             for sample in samples:
-                fields = sample._fields
+                child = sample.child
                 if self._passed is not None:
                     self._passed.add(sample)
-                self._latest[fields[1]] = provenance
-                if fields[5]:
-                    self._settled[fields[1]] = provenance.rank
+                latest = self._latest.get(child)
+                # A sample of another bus that is late does not make the frame its own.
+                if latest is None or latest.sequence < provenance.sequence or latest.rank < provenance.rank:
+                    self._latest[child] = provenance
+                if sample.static:
+                    self._settled[child] = provenance.rank
             outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
             for outbox in self._outboxes:
                 outbox.add_batch(outgoing, echo=outbox is provenance.outbox)

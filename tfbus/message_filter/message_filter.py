@@ -137,12 +137,12 @@ class MessageQueue(Generic[MessageT, AnswerT]):
     capacity : int
         How many may wait or be ready; at least one. The caller of `append` makes room first.
     order : {"ready", "stamp", "arrival"}
-        With ``"stamp"`` and ``"arrival"``, a message that waits holds back those behind it.
+        With ``"stamp"`` and ``"arrival"``, a message that waits holds back all later ones.
 
     Raises
     ------
     TypeError, ValueError
-        If `capacity` is not an integer of at least one, or `order` none of these.
+        If `capacity` is not an integer of at least one, or `order` has another value.
     """
 
     def __init__(self, capacity: int, order: Order) -> None:
@@ -154,7 +154,7 @@ class MessageQueue(Generic[MessageT, AnswerT]):
         self.unanswered = 0
         self._arrivals = count()
         self._pending: dict[int, PendingMessage[MessageT, AnswerT]] = {}
-        # The places in the order of delivery; with "ready", only those of answered messages.
+        # The places in the order of delivery; with "ready", only the places of answered messages.
         self._line: list[tuple[int, int]] = []
 
     def __len__(self) -> int:
@@ -198,7 +198,7 @@ class MessageQueue(Generic[MessageT, AnswerT]):
             self._line_up(pending, pending.stamp)
 
     def set_answer(self, pending: PendingMessage[MessageT, AnswerT], answer: AnswerT, moment: int) -> None:
-        """Give a waiting message its answer. Of two at one moment, the one that arrived first is ready first."""
+        """Give a waiting message its answer. If two get theirs at one moment, the first to arrive is ready first."""
         pending.answer = answer
         self.unanswered -= 1
         if pending.place is None:
@@ -239,7 +239,7 @@ class Targets(Generic[AnswerT]):
     target : str or sequence of str
         With one, an answer is a transform; with a sequence, a tuple of transforms in that order.
     tolerance : float
-        In s. The transform at this much later has to be known too.
+        In s. The transform this much later has to be known too.
 
     Raises
     ------
@@ -277,7 +277,7 @@ class Targets(Generic[AnswerT]):
         Raises
         ------
         TransformLookupError
-            If there is none. An error that waiting cannot help is raised before one that it may help.
+            If there is none. Among several errors, an error that waiting cannot help is raised first.
         """
         now = self._buffer.bus.clock.now() if isinstance(stamp, Latest) else stamp
         found = {frame: answer_of(frame, frame, now, IDENTITY, static=True)}
@@ -293,7 +293,7 @@ class Targets(Generic[AnswerT]):
         return cast(AnswerT, answers[0] if self._one else answers)
 
     async def wait(self, frame: str, stamp: int | Latest) -> None:
-        """Wait until each question has had an answer; the errors are those of `Buffer.lookup`."""
+        """Wait until each question has had an answer; the errors are as in `Buffer.lookup`."""
         await self._buffer._lookup_among([Question(target, frame, at) for target, at in self.questions(frame, stamp)])
 
     def blocker(self, frame: str, stamp: int | Latest) -> TransformLookupError | None:
@@ -327,7 +327,7 @@ class Targets(Generic[AnswerT]):
 
 
 MessageOverflow = Literal["drop_oldest", "drop_newest", "block"]
-"""Drop the message that arrived first, drop the one that arrives, or stop reading the source."""
+"""Drop the oldest message, drop the new message, or stop reading the source."""
 
 
 class MessageFilter(Generic[MessageT, AnswerT]):
@@ -341,28 +341,28 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     ----------
     messages : async iterable
         The source: an async generator, a stream of anyio, anything with ``__aiter__``. Leaving the ``async with``
-        closes an async generator, which can be read no further, and no other source.
+        closes an async generator for good, but no other source.
     buffer : Buffer
     target : str or sequence of str
         The frame into which the transforms lead. With a sequence, all of them are needed, and the pair holds a tuple of
-        transforms in that order. A message that is in the target already is ready at
-        once, also if the buffer does not know it.
+        transforms in that order. A message that is in the target already is ready at once, even if the buffer does not
+        know the target.
     frame, stamp : callable, optional
         Give the frame and the stamp (ns, or `LATEST`) of a message; by default its attributes `frame` and `stamp`.
     tolerance : float
-        In s. It demands more, unlike that of a lookup: a message is ready only when the transforms at its stamp and at
-        this much later are both known.
+        In s. A message is ready only when the transforms at its stamp and this much later are both known. So it demands
+        more, whereas the `tolerance` of a lookup allows more.
     timeout : float, optional
         How long a message may wait, in s on the bus's clock from its arrival; None for ever. A ready message does not
         time out.
     capacity : int
         How many messages may wait or be ready and unread.
     overflow : {"drop_oldest", "drop_newest", "block"}
-        The consequence when one more arrives: the oldest is dropped, or the new one, or none, because the source is not
-        read until there is room. Use ``"block"`` for a source that does not wait by itself, such as a recording.
+        If a message arrives while the filter is full: drop the oldest message, drop the new message, or stop reading
+        the source until there is room. Use ``"block"`` for a source that does not wait by itself, such as a recording.
     order : {"ready", "stamp", "arrival"}
-        Deliver messages as they become ready; or by stamp, which holds back messages newer than one that waits; or in
-        the order of arrival, which holds back messages that came after one that waits.
+        Deliver messages as they become ready, or by stamp, or in the order of arrival. A waiting message holds back
+        newer messages with ``"stamp"``, and later ones with ``"arrival"``.
     on_drop : callable, optional
         Called with a message, the reason, and the error that says what it lacked, or None for a ready message. If it
         raises an `Exception`, that is logged once and counted.
@@ -372,7 +372,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     UnknownFrameError
         If a target cannot be the name of a frame.
     TypeError, ValueError
-        If an argument is of the wrong type, negative, or none of the words above.
+        If an argument is of the wrong type, negative, or not one of the words above.
 
     Notes
     -----

@@ -1,7 +1,7 @@
 """Pictures of motions by matplotlib, from a tree such as a loaded recording.
 
-`plot_transforms` draws coordinates over time, `plot_path` the paths of frames, and `plot_gaps` when each frame was
-heard; each returns matplotlib's own figure. `sparklines` draws with letters. Needs ``pip install "tfbus[plot]"``.
+`plot_transforms` draws coordinates over time, `plot_path` the paths of frames, and `plot_gaps` the times at which each
+frame was heard. Each returns a matplotlib figure. `sparklines` draws with letters. Needs ``pip install "tfbus[plot]"``.
 """
 
 from tfbus.errors import pip_install
@@ -11,7 +11,7 @@ try:
 except ImportError as error:
     if error.name is None or error.name.startswith("tfbus"):
         raise
-    raise ImportError(f"for plots, tfbus needs a package more: {pip_install('plot')} ({error})") from error
+    raise ImportError(f"for plots, tfbus needs one more package: {pip_install('plot')} ({error})") from error
 from tfbus.plot.plots import Reception, Series, read_reception, read_series, sparklines
 
 __all__ = [

@@ -1,7 +1,7 @@
 """Plots of recordings with matplotlib, and a `Series` as lines of letters for terminals.
 
-`plot_transforms` draws x, y, z and roll, pitch, yaw over time, `plot_path` a path from above or in space, `plot_gaps`
-when each frame was heard, with its periods and delays.
+`plot_transforms` draws x, y, z and roll, pitch, yaw over time; `plot_path` a path from above or in space; `plot_gaps`
+the times at which each frame was heard, with its periods and delays.
 """
 
 import os
@@ -22,12 +22,12 @@ from tfbus.stamps import SECOND, Stamps, time_between
 from tfbus.tree.tree import TransformTree
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-"""Of M. Okabe and K. Ito, "Color Universal Design" (2008)."""
+"""The colours of M. Okabe and K. Ito, "Color Universal Design" (2008)."""
 DASHES = ("-", "--", "-.", ":")
 
 
 LONGEST_NAME = 60
-"""Letters of a name in a figure; a legend with longer ones leaves no room for the axes."""
+"""The greatest length of a name in a figure: a legend with longer names leaves no room for the axes."""
 
 
 def new_figure(figure: Figure | None, width: float, height: float) -> Figure:
@@ -36,7 +36,7 @@ def new_figure(figure: Figure | None, width: float, height: float) -> Figure:
 
 
 def shown(name: str) -> str:
-    """A name as the text of a figure: short, with no formula in it, and none of the labels that a legend leaves out."""
+    """A name as the text of a figure: short, without formulas, and never a label that a legend leaves out."""
     text = printable(name)
     if len(text) > LONGEST_NAME:
         half = LONGEST_NAME // 2
@@ -46,7 +46,7 @@ def shown(name: str) -> str:
 
 
 def line_styles(count: int) -> list[dict[str, Any]]:
-    """The colour and the dashes of so many lines; no two of the first 28 are alike."""
+    """The colours and dashes of `count` lines; the first 28 are all different."""
     colours = cycle(COLOURS)
     return [{"color": next(colours), "linestyle": DASHES[i // len(COLOURS) % len(DASHES)]} for i in range(count)]
 
@@ -62,7 +62,7 @@ def show_in_window(draw: Callable[[Figure], object]) -> None:
     Raises
     ------
     RuntimeError
-        If matplotlib can open no window here.
+        If matplotlib cannot open a window here.
     """
     if plt.get_backend().lower() == "agg":
         raise RuntimeError("matplotlib has no window here" if os.environ.get("DISPLAY") else "there is no display")
@@ -204,7 +204,7 @@ def read_reception(messages: Iterable[RecordedMessage]) -> dict[str, Reception]:
 
 
 GAP = 3.0
-"""A pause is a gap if it is longer than so many times the usual period of its frame."""
+"""A pause is a gap if it is longer than the usual period of its frame by this factor."""
 _BINS = 60
 
 
@@ -328,7 +328,7 @@ def _letters(values: Floats, low: float, high: float) -> str:
 
 _NAMES = (("x [m]", "y [m]", "z [m]"), ("roll [deg]", "pitch [deg]", "yaw [deg]"))
 _LEAST_SPAN = 1e-6
-"""m and deg; smaller changes are those of rounding."""
+"""In m and deg: smaller changes come from rounding."""
 
 
 def plot_transforms(

@@ -1,4 +1,4 @@
-"""`convert`, which writes recordings to a new one, in another format, in part, or together."""
+"""`convert`, which writes recordings to a new one: in another format, a part of one, or several merged."""
 
 import heapq
 import os
@@ -58,14 +58,14 @@ class Edits:
     rename : mapping of str to str
         New names of frames.
     prefix : str
-        Put before the names of all frames that are not renamed.
+        A prefix for the names of all frames that are not renamed.
     drop_static : bool
         Whether static transforms are left out.
 
     Raises
     ------
     ValueError
-        If a new name or the prefix is empty or starts with a slash; an empty prefix is none.
+        If a new name is empty, or a new name or the prefix starts with a slash.
     """
 
     frames: Collection[str] | None = None
@@ -111,7 +111,7 @@ _NUMBERS = struct.Struct("<7d")
 
 @dataclass(frozen=True, slots=True)
 class StaticTransform:
-    """A static transform of a recording, with its numbers as they are there."""
+    """A static transform of a recording, with its numbers unchanged."""
 
     parent: str
     child: str
@@ -164,8 +164,8 @@ def convert(
     """Write recordings to a new one, all messages in the order of their log times.
 
     Transforms keep every bit of their stamps and numbers, even invalid ones. Other messages, and messages whose
-    transforms no edit changes, are passed through as they are. Where the new format cannot hold
-    their encoding, they are converted between CDR and ROS 1; what cannot be converted is left out and counted.
+    transforms no edit changes, are copied unchanged. If the new format cannot hold their encoding, they are converted
+    between CDR and ROS 1; a message that cannot be converted is left out and counted.
 
     Parameters
     ----------
@@ -182,8 +182,8 @@ def convert(
     overwrite : bool
         Whether to replace an existing file.
     schema : {"ros", "foxglove"}
-        The schema of transforms: ROS' ``TFMessage``, where they are not Foxglove's already and nothing changes them; or
-        Foxglove's ``FrameTransforms`` in Protocol Buffers, for MCAP only.
+        The schema of transforms. ``"ros"`` writes ROS's ``TFMessage``, but keeps messages in Foxglove's schema that
+        nothing changes; ``"foxglove"`` writes ``FrameTransforms`` in Protocol Buffers, for MCAP only.
     progress : callable, optional
         Called with 1 for each message that is read.
 
@@ -196,9 +196,10 @@ def convert(
     RecordingError
         If an input cannot be read, or the packages are missing.
     ValueError
-        If the output has another ending, or is one of the inputs; if `schema` is another, or does not fit the ending.
+        If the output has another ending, or is one of the inputs; if `schema` has another value, or does not fit the
+        ending.
     FileExistsError
-        If the output is there already.
+        If the output exists already.
     OSError
         If it cannot be written; then there is no output, and an existing file stays as it was.
     """
@@ -226,7 +227,7 @@ def convert(
             copy = make(part, target.name)
         except ImportError as error:
             extras = "bag,foxglove" if schema == "foxglove" else "bag"
-            problem = f"to write it, tfbus needs some packages more: {pip_install(extras)} ({error})"
+            problem = f"to write it, tfbus needs more packages: {pip_install(extras)} ({error})"
             raise RecordingError(problem, path=str(target), reason="missing extra") from error
         stack.callback(copy.close)
         run = _Run(copy, Edits() if edits is None else edits, topics)
@@ -240,9 +241,9 @@ def convert(
 
 @contextmanager
 def new_file(target: Path) -> Iterator[Path]:
-    """A path to write a file at, which takes the place of another one at the end of the ``with``, if nothing fails.
+    """A path for a new file that replaces the target at the end of the ``with``, if nothing fails.
 
-    It is in a new folder that only this user may enter. So no link that somebody has made leads it elsewhere.
+    It is in a new folder that only this user may enter, so no symbolic link of another user can redirect it.
 
     Raises
     ------
@@ -332,7 +333,7 @@ class _Run:
         self.result.transforms += len(kept)
 
     def _output(self, channel: Channel, runs: tuple[tuple[str, int], ...]) -> Channel:
-        """The channel for the transforms of another one, from the given authorities."""
+        """The output channel for the transforms of an input channel, from the given authorities."""
         runs = runs if len(runs) > 1 else tuple((name, 1) for name, _ in runs)
         key = channel, runs
         if key not in self._outputs:

@@ -24,9 +24,9 @@ class HeaderStamps(NamedTuple):
     stamps: npt.NDArray[np.int64]
     """ns, in the order of the log times."""
     from_headers: bool
-    """Whether they are those of the headers; else the messages have no header, and these are their log times."""
+    """Whether the stamps are from headers. If not, the messages have no header, and the stamps are their log times."""
     unreadable: int
-    """The number of messages that are too short and of damaged places of the file, which are left out."""
+    """The number of messages that are too short, and of damaged places of the file; both are left out."""
 
 
 def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
@@ -74,7 +74,7 @@ def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
 
 
 def begins_with_header(channel: Channel) -> bool:
-    """Whether the messages of a channel of ROS begin with a header, by the definition in the file or that of ROS 2."""
+    """Whether the messages of a channel of ROS begin with a header, by the definition in the file, or in ROS 2."""
     if channel.encoding not in ("cdr", "ros1"):
         return False
     if channel.schema and channel.schema_encoding in ("ros1msg", "ros2msg"):
@@ -82,7 +82,7 @@ def begins_with_header(channel: Channel) -> bool:
             field = line.partition("#")[0].split()
             if line.startswith("==="):
                 return False
-            # A constant is no field.
+            # A constant is not a field.
             if field and "=" not in line.partition("#")[0]:
                 return field[0] in _HEADER_TYPES
         return False

@@ -39,10 +39,10 @@ def load_joint_states(
     since, until : int, optional
         The first and the last log time, in ns.
     prefix : str
-        Put before the names of all frames.
+        A prefix for the names of all frames.
     problems : Counter, optional
         Gets the number of positions and messages that were left out: ``"unknown joint"``, the reasons of
-        `InvalidTransformError`, and those of damage.
+        `InvalidTransformError`, and the reasons of damage.
 
     Returns
     -------

@@ -51,7 +51,7 @@ class ReadAhead:
         self._receive: anyio.streams.memory.MemoryObjectReceiveStream[Block]
 
     async def __aenter__(self) -> "ReadAhead":
-        # The semaphore bounds it: nothing is read that is not wanted.
+        # The semaphore bounds how far it reads ahead.
         send, self._receive = anyio.create_memory_object_stream[Block](math.inf)
         self._tasks = await anyio.create_task_group().__aenter__()
         self._tasks.start_soon(self._read, send)
@@ -111,7 +111,7 @@ class Player:
     for samples that are not recorded.
 
     On a bus with a `SimulatedClock` the player drives that clock: the clock jumps to the beginning of the recording and
-    then advances from the log time of one message to that of the next, so timed tasks run as they did during the
+    then advances from the log time of one message to the next log time, so timed tasks run as they did during the
     recording, at any rate. No other task may advance the clock meanwhile. Beginning again and seeking back are jumps
     back of the clock.
 
@@ -137,8 +137,8 @@ class Player:
     bus : Bus
     path : str
     start, end : int or None
-        The first and the last log time of what is played, in ns; None until `play` has opened the recording, and for an
-        empty recording.
+        The first and the last log time of the played part, in ns; None until `play` has opened the recording, and for
+        an empty recording.
     position : int or None
         The log time of the last message that was played, in ns.
     messages : int
@@ -275,7 +275,7 @@ class Player:
             self._stir()
 
     def step(self) -> None:
-        """Pause, and play the next message at once; called again before it is played, one message more."""
+        """Pause, and play the next message at once; each call plays one more message."""
         self.pause()
         self._steps += 1
         self._stir()
@@ -299,7 +299,7 @@ class Player:
         self._origin_time = now
 
     async def _open_into(self, opened: list[Recording]) -> None:
-        # A task of its own: `Task.cancel` of asyncio would end the wait for the thread and lose what it opens.
+        # A task of its own: `Task.cancel` of asyncio would end the wait for the thread and lose the opened file.
         opened.append(await anyio.to_thread.run_sync(self._open))
 
     def _open(self) -> Recording:
@@ -376,7 +376,7 @@ class Player:
             if self._seek_target is not None:
                 return
             if self._paused:
-                # A step of the user goes to the message.
+                # `step` was called: go up to the message.
                 step = max(0, min(stamp - clock.now(), from_seconds(_MAX_STEP)))
             await clock.advance(to_seconds(step))
             if self._seek_target is not None or clock.now() >= stamp:
@@ -384,7 +384,7 @@ class Player:
 
     async def _sleep_until_due(self, stamp: int) -> None:
         await anyio.lowlevel.checkpoint()
-        # Only the state counts: a pause may come when the time is over, but this task has not gone on yet.
+        # Look at the state after each wait: a pause may come between the end of a wait and this task's next turn.
         while self._seek_target is None:
             if self._paused:
                 if self._steps:

@@ -36,8 +36,8 @@ class WriteQueue(SampleQueue):
     Parameters
     ----------
     capacity : int
-        The greatest number of pending moving samples, and of pending batches; the newest batch always stays. Of the
-        static samples in dropped batches, the newest one of each child is kept beyond that.
+        The greatest number of pending moving samples, and of pending batches; the newest batch always stays. Of dropped
+        batches, the newest static sample of each child is kept in addition.
 
     Attributes
     ----------
@@ -107,16 +107,16 @@ class Recorder:
     Raises
     ------
     ValueError, TypeError
-        If `capacity` is less than one, or no integer.
+        If `capacity` is less than one, or not an integer.
 
     Notes
     -----
     Entering raises the `OSError` of a file that cannot be created, `FileExistsError` for a file that exists,
     `ImportError` if the extra is missing, and `BusClosedError` if the bus is closed. After that, a disk that is full or
     fails, and a file that somebody removes, replaces or cuts, cause a `RecordingFailed` event; the error is kept in
-    `error` and logged, but raised nowhere: the body goes on. `statistics` tells how many samples the file still holds,
-    none of one that was removed or cut; all that are published later count as dropped. A file that is moved is
-    recorded to its end, and then told in the same way.
+    `error` and logged, but never raised: the body goes on. `statistics` tells how many samples the file still holds:
+    none if it was removed or cut. All later samples count as dropped. If the file is moved, recording continues to the
+    end, and is then reported in the same way.
 
     Leaving waits for the disk, also when the body is cancelled. The log time of a batch is the time of its publication
     on the bus's clock. The format cannot express that a frame was removed, nor that the clock jumped back: programs

@@ -3,9 +3,9 @@
 The first bytes of a file choose a `Storage` in `tfbus.recording.formats`, which gives the payloads of messages by log
 time. `Selection` chooses the channels. Then two ways lead from bytes to samples, and both give the same bits:
 
-* `Recording.messages` decodes one message after the other (`ChannelDecoder`), and tells what is wrong with each.
+* `Recording.messages` decodes one message after the other (`ChannelDecoder`), with an error for each bad transform.
 * `Recording.blocks` gives many messages at once. `Block.columns` decodes all of them with numpy (`ColumnDecoder`), if
-  nothing in the block needs a judgement; else `Block.messages` decodes them one by one.
+  nothing in the block has to be judged; otherwise `Block.messages` decodes them one by one.
 
 `fill` tries the columns first, and appends them to histories that exist already. Where an edge is new or changes, each
 sample is judged: by `max_translation`, by `SpeedLimit`, and by `without_loops`. Damage raises nothing anywhere: it is
@@ -57,7 +57,7 @@ class RecordedMessage(NamedTuple):
 
     @property
     def is_report(self) -> bool:
-        """Whether it stands for no message of the file, but reports a loss there."""
+        """Whether this is not a message of the file, but the report of a loss there."""
         return any(error.reason in ("damaged", "unfinished") for error in self.errors)
 
 
@@ -83,7 +83,7 @@ class Selection:
         Topics, with a prefix for each if it is a mapping. By default ``/tf``, ``/tf_static``, and all topics with
         Foxglove's transforms outside of namespaces.
     prefix : str
-        Put before the names of all frames.
+        A prefix for the names of all frames.
     namespaces : bool
         Whether ``tf`` and ``tf_static`` in all namespaces are read, each under the prefix of its namespace.
 
@@ -92,7 +92,7 @@ class Selection:
     ValueError
         If both `topics` and `namespaces` are given, or a prefix begins with a slash.
     TypeError
-        If a topic or a prefix is no string.
+        If a topic or a prefix is not a string.
     """
 
     def __init__(self, topics: Topics = None, prefix: str = "", namespaces: bool = False) -> None:
@@ -215,7 +215,7 @@ class RecordedTopic:
     read : bool
         Whether its messages are read as transforms.
     ignored : bool
-        Whether its name or its type promises transforms, and it is not read.
+        Whether it is not read although its name or its type promises transforms.
     """
 
     name: str
@@ -239,8 +239,8 @@ class Recording:
     ----------
     path : Path
     finished : bool
-        Whether the file has the end that a writer gives it. If not, the last messages may be missing, and a reading of
-        the end reports ``"unfinished"``.
+        Whether its writer finished the file. If not, the last messages may be missing, and a reading of the end reports
+        ``"unfinished"``.
     """
 
     def __init__(self, path: Path, storage: Storage, selection: Selection) -> None:
@@ -271,7 +271,7 @@ class Recording:
 
     @property
     def topics(self) -> tuple[RecordedTopic, ...]:
-        """All topics that are known, sorted by name; without an index, these are those met so far by reading."""
+        """All known topics, sorted by name; without an index, only the topics that a reading has met so far."""
         found: dict[tuple[str, str], RecordedTopic] = {}
         for channel, count in self._opened.channels.items():
             key = channel.topic, channel.type
@@ -294,8 +294,8 @@ class Recording:
 
         Damage raises nothing: it is reported in the `errors` of a message, and reading continues behind it. An MCAP
         file without an index, because its writer was killed, is read in the order of the file. At the end of a reading
-        without limits, the number of messages is compared with what the file promises. A reading that reaches the end
-        of a file without its index ends with a report, an error whose reason is ``"unfinished"``.
+        without limits, the number of messages is compared with the number that the file promises. At the end of a file
+        without its index, a reading ends with a report, an error whose reason is ``"unfinished"``.
 
         Parameters
         ----------
@@ -331,7 +331,7 @@ class Recording:
         latched: dict[str, TransformStamped] = {}
         for stored in storage.messages(self._is_static, None, since - 1):
             for sample in self._message(stored).batch:
-                # In the order of the samples that stay.
+                # In the order of the newest samples.
                 latched.pop(sample.child, None)
                 latched[sample.child] = sample
         for sample in latched.values():
@@ -421,29 +421,30 @@ def open_recording(
         topic is static if its name ends with ``_static``. By default ``/tf``, ``/tf_static``, and all topics of
         Foxglove's ``FrameTransform`` and ``FrameTransforms`` that are no ``tf`` of a namespace.
     prefix : str
-        Put before the names of all frames.
+        A prefix for the names of all frames.
     namespaces : bool
         Read ``tf`` and ``tf_static`` of all namespaces; the frames of ``/robot1/tf`` get the prefix ``robot1/``.
 
     Raises
     ------
     RecordingError
-        If the file is missing or empty, cannot be read, was cut off before its first message, or is no recording; if a
-        topic in `topics` is not there, or has no transforms; or if the packages that read it are not installed.
+        If the file is missing or empty, cannot be read, was cut off before its first message, or is not a recording; if
+        a topic in `topics` is not there, or has no transforms; or if the packages that read it are not installed.
     ValueError, TypeError
         If both `topics` and `namespaces` are given, or a prefix begins with a slash.
 
-    Notes ----- The sizes that a file claims or unfolds to are bounded, and what exceeds its bound is left out and
-    reported: 8 MiB for a message with transforms, 256 MiB for any other, for a chunk (and a million messages in it) and
-    for a value in SQLite, 4 MiB for ``metadata.yaml``. A compressed file in a folder unfolds to at most 100 times its
+    Notes
+    -----
+    The sizes that a file claims or unfolds to are bounded; data beyond a bound are left out and reported. The bounds
+    are 8 MiB for a message with transforms, 256 MiB for any other, for a chunk (and a million messages in it) and for a
+    value in SQLite, and 4 MiB for ``metadata.yaml``. A compressed file in a folder unfolds to at most 100 times its
     size, or 64 MiB if that is more, in a nameless temporary file. An index of more than 64 MiB is not used. The
     descriptions of all channels and types take at most 64 MiB. All compressed chunks together unfold to at most 1,000
-    times the size of the file, or 1 GiB if that is more; the chunks behind that are left out. Messages of chunks that
-    overlap in time are sorted in memory up to 512 MiB. With all that, reading a hostile file takes at most 2 GiB of
-    memory.
+    times the size of the file, or 1 GiB if that is more; later chunks are left out. Messages of chunks that overlap in
+    time are sorted in memory up to 512 MiB. So reading a hostile file takes at most 2 GiB of memory.
 
-    An SQLite file beside which a writer has left a journal is copied to a temporary folder, where SQLite undoes the
-    last transaction; if the writer still runs, the file is read in its place.
+    If a writer has left a journal beside an SQLite file, the file is copied to a temporary folder, where SQLite undoes
+    the last transaction. If the writer still runs, the original is read.
     """
     file = Path(path)
     selection = Selection(topics, prefix, namespaces)
@@ -460,7 +461,7 @@ def open_storage(file: Path) -> Storage:
     try:
         return _open_storage(file, folders=True)
     except ImportError as error:
-        problem = f"to read it, tfbus needs some packages more: {pip_install('bag')} ({error})"
+        problem = f"to read it, tfbus needs more packages: {pip_install('bag')} ({error})"
         raise RecordingError(problem, path=str(file), reason="missing extra") from error
     except FileNotFoundError as error:
         raise MissingRecordingError(path=str(file)) from error
@@ -484,7 +485,9 @@ def _open_storage(path: Path, folders: bool = False) -> Storage:
             return open_format(path)
         if magic.startswith(first):
             raise RecordingError(f"the file ends after {len(first)} bytes", path=str(path), reason="truncated")
-    raise RecordingError("it is no recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)", path=str(path), reason="foreign")
+    raise RecordingError(
+        "it is not a recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)", path=str(path), reason="foreign"
+    )
 
 
 # Each format imports packages of its own, so only the one of the file is imported.
@@ -517,7 +520,7 @@ _MAX_CANDIDATES = 16
 
 
 class SpeedLimit:
-    """Decides for each moving sample whether its frame can have moved there from the last one that was kept.
+    """Decides for each moving sample whether its frame can have moved there since its last kept sample.
 
     Parameters
     ----------
@@ -546,7 +549,7 @@ class SpeedLimit:
         self._candidates: dict[tuple[str, str], list[TransformStamped]] = {}
 
     def admit(self, batch: Batch) -> Batch:
-        """The samples of a batch that are kept, behind earlier ones that this batch has confirmed."""
+        """The kept samples of a batch, after the earlier samples that this batch has confirmed."""
         kept: list[TransformStamped] = []
         for sample in batch:
             if sample.static:
@@ -556,7 +559,7 @@ class SpeedLimit:
         return tuple(kept)
 
     def undecided(self) -> Batch:
-        """At the end of all samples: the first sample of each frame that has no two samples in agreement."""
+        """At the end of all samples: the first sample of each frame without two samples that agree."""
         kept = []
         for candidates in self._candidates.values():
             kept.append(candidates[0])
@@ -653,12 +656,12 @@ def load(
     topics, prefix, namespaces
         As `open_recording`.
     max_speed : float, optional
-        In m/s. A moving sample that is further from the last one of its frame that was kept, by stamp, than this speed
-        allows, is left out and counted as ``"speed"``. If the first samples of a frame contradict each other, the first
-        one that a later one agrees with is kept.
+        In m/s. A moving sample is left out, and counted as ``"speed"``, if its frame cannot have come there from its
+        last kept sample, by stamp, at this speed. If the first samples of a frame contradict each other, the first
+        sample that a later one confirms is kept.
     problems : Counter, optional
-        Gets the number of transforms and messages that were left out, by reason. Without it, they are logged as a
-        warning, as is what was not read although it may hold transforms.
+        Gets the number of transforms and messages that were left out, by reason. Without it, a warning logs them, and
+        topics and files that were not read although they may hold transforms.
     max_translation : float
         The greatest magnitude of a translation, in m, at most 1e100.
 
@@ -741,7 +744,7 @@ def fill(
 
 
 def _append(forest: Forest, columns: list[Columns], max_translation: float) -> bool:
-    """Insert the samples of a block, if no edge changes by them; returns whether that was so."""
+    """Insert the samples of a block unless they change an edge; returns whether they were inserted."""
     together: dict[str, list[Columns]] = {}
     for each in columns:
         x, y, z = each.rows[:, :3].T
@@ -755,7 +758,7 @@ def _append(forest: Forest, columns: list[Columns], max_translation: float) -> b
         if len(parts) == 1 and forest.can_append(first.parent, child, first.authority, first.stamps):
             forest.append(child, first.stamps, first.rows)
         else:
-            # Such as a stamp that comes again, or several authorities.
+            # The unusual case, such as a repeated stamp, or several authorities.
             samples = [
                 (place, sample) for part in parts for place, sample in zip(part.order, _samples(part), strict=True)
             ]
@@ -800,7 +803,7 @@ def without_loops(
         Every edge has a sample, because nothing is ever removed from a recording.
     batch : tuple of TransformStamped
     parents : container of str
-        The frames that are a parent of one of the edges.
+        The parents of the edges.
     problems : Counter
     max_translation : float
         In m.

@@ -20,7 +20,7 @@ _SAME = {"translation": "xyz", "rotation": "quaternion"}
 """The names that ``tfbus convert --static-to-yaml`` writes."""
 _ROTATIONS = ("rpy", "rpy_deg", "quaternion")
 _LONGEST: Final = 1_000
-"""Letters of an error."""
+"""The greatest length of an error, in letters."""
 
 
 def save_static(path: str | os.PathLike[str], samples: Iterable[TransformStamped]) -> None:
@@ -64,21 +64,22 @@ def load_static(path: str | os.PathLike[str], *, authority: str = "") -> list[Tr
 
     The file is a list in YAML or JSON. Each entry has a ``parent`` and a ``child``; ``xyz`` in m; one of ``rpy`` (roll,
     pitch and yaw about fixed axes, in rad), ``rpy_deg`` (degrees) and ``quaternion`` (x, y, z, w); and an
-    ``authority``. All but the names of the frames may be left out. What `TransformStamped.to_dict` gives is an entry
-    too, and so is what ``tfbus convert --static-to-yaml`` writes, with ``translation`` and ``rotation``.
+    ``authority``. Only the names of the frames are required. An entry may also have the form of
+    `TransformStamped.to_dict`, or the form of ``tfbus convert --static-to-yaml``, with ``translation`` and
+    ``rotation``.
 
     Parameters
     ----------
     path : path
-        Of YAML, unless it ends in ``.json``.
+        A file of YAML, unless it ends in ``.json``.
     authority : str
         The sender of entries that name none.
 
     Raises
     ------
     RecordingError
-        If the file is not such a list, has more than 64 MiB (4 MiB of YAML that is no JSON), or an entry is not valid;
-        the message has its number. A file that is not there is a `FileNotFoundError` as well.
+        If the file is not such a list, has more than 64 MiB (4 MiB of YAML that is not JSON), or an entry is not valid;
+        the message has its number. For a missing file, the error is a `FileNotFoundError` as well.
     ImportError
         If YAML beyond JSON needs the extra: ``pip install "tfbus[bag]"``.
     """
@@ -119,10 +120,10 @@ def _parse(text: str) -> Any:
     try:
         from ruamel.yaml import YAML
     except ImportError as error:
-        raise ImportError(f"to read YAML, tfbus needs a package more: {pip_install('bag')}") from error
+        raise ImportError(f"to read YAML, tfbus needs one more package: {pip_install('bag')}") from error
     try:
         return YAML(typ="safe", pure=True).load(text)
-    # For damaged text, a parser of YAML raises more than its own errors; deep nesting is one of recursion.
+    # For damaged text, a parser of YAML raises more than its own errors; deep nesting is a `RecursionError`.
     except Exception as error:  # noqa: BLE001
         raise ValueError(str(error) or type(error).__name__) from None
 

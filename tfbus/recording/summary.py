@@ -30,10 +30,7 @@ from tfbus.stamps import SECOND, STAMP_MAX, time_between, to_seconds
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """The mean of some durations, the one that 99 % of them do not exceed, and the greatest; in s.
-
-    The one that 99 % do not exceed is known to 1 %.
-    """
+    """The mean, the 99th percentile and the maximum of some durations, in s. The percentile is exact to 1 %."""
 
     mean: float
     p99: float
@@ -42,7 +39,7 @@ class Spread:
 
 _GROWTH: Final = math.log(1.01)
 _SINGLE: Final = 1_000
-"""Durations that come in few are counted so many at once."""
+"""Single durations are collected, and counted together once there are this many."""
 
 
 class Durations:
@@ -68,7 +65,7 @@ class Durations:
         return whole
 
     def add_one(self, duration: int) -> None:
-        """Count a duration in ns; one that does not fit 64 bits as the longest that does."""
+        """Count a duration in ns; if it exceeds 64 bits, count the longest duration that does not."""
         self._single.append(max(-STAMP_MAX, min(duration, STAMP_MAX)))
         if len(self._single) >= _SINGLE:
             self._count_single()
@@ -112,7 +109,7 @@ class Durations:
 
 
 _AT_ONCE: Final = 50_000
-"""So many stamps are merged at once, roughly."""
+"""The number of stamps that are merged at once, roughly."""
 
 
 class Periods:
@@ -142,7 +139,7 @@ class Periods:
         self._different = 0
         total = sum(map(len, columns))
         longest = max(columns, key=len, default=np.empty(0, np.int64))
-        # Windows that end at stamps of the longest one hold about as many stamps of all others.
+        # Windows that end at stamps of the longest array hold about as many stamps of every other array.
         step = max(1, _AT_ONCE * len(longest) // max(total, 1))
         ends = [*longest[step::step].tolist(), None] if columns else []
         firsts = [0] * len(columns)
@@ -187,7 +184,7 @@ class Periods:
 
 @dataclass(frozen=True, slots=True)
 class FrameSummary:
-    """The summary of one frame of a recording; values that need more moving samples than there are, are None.
+    """The summary of one frame of a recording. A value is None if there are too few moving samples for it.
 
     Parameters
     ----------
@@ -354,7 +351,7 @@ def summarise(
 
 
 class _Counts:
-    """All that is counted while a recording is read."""
+    """The counts of one reading."""
 
     def __init__(self) -> None:
         self.frames: dict[str, _Frame] = {}
@@ -368,7 +365,7 @@ class _Counts:
         return {authority for frame in self.frames.values() for authority in frame.sent}
 
     def add_columns(self, columns: list[Columns]) -> bool:
-        """Count the samples of a block, if no edge has to be judged; returns whether that was so."""
+        """Count the samples of a block unless an edge has to be judged; returns whether they were counted."""
         for each in columns:
             frame = self.frames.get(each.child)
             if frame is None or frame.static or each.static or frame.parent != each.parent:

@@ -1,7 +1,7 @@
 """Robots described in URDF, and the transforms of their links for given positions of the joints.
 
 A `RobotModel` is a tree of links and joints, read from a URDF file or built by hand; a `RobotStatePublisher` publishes
-its transforms on a bus. `read_visuals` reads the visible shapes of the links, which only pictures need.
+its transforms on a bus. `read_visuals` reads the visible shapes of the links, for pictures.
 """
 
 from tfbus.robot.model import (

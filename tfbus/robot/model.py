@@ -32,7 +32,7 @@ KINDS: tuple[JointKind, ...] = get_args(JointKind)
 
 @dataclass(frozen=True, slots=True)
 class Mimic:
-    """A joint that follows another: its position is `multiplier` times that of `joint`, plus `offset` (rad or m)."""
+    """A joint follows another: its position is `multiplier` times the position of `joint`, plus `offset` (rad or m)."""
 
     joint: str
     multiplier: float = 1.0
@@ -48,7 +48,7 @@ class Joint:
     name : str
     kind : {"fixed", "revolute", "continuous", "prismatic", "planar", "floating"}
     parent, child : str
-        The links, whose names are those of their frames.
+        The links; each has a frame of the same name.
     origin : Transform
         The pose of the child in the parent at position zero.
     axis : tuple of 3 floats
@@ -57,7 +57,7 @@ class Joint:
     lower, upper : float, optional
         The limits of the position, in rad or m. Violations are reported, never prevented.
     mimic : Mimic, optional
-        The joint that this one follows when it has no position of its own.
+        The joint that this joint follows when it has no position of its own.
 
     Raises
     ------
@@ -67,8 +67,8 @@ class Joint:
     Notes
     -----
     A planar joint has the coordinates x and y in m and an angle in rad about the axis. URDF does not define the
-    directions of x and y: here they are those of the child at position zero, rotated by the shortest rotation that
-    takes z to the axis. So for the usual axis z they are just x and y.
+    directions of x and y. Here they are the child's x and y at position zero, turned by the shortest rotation from z to
+    the axis. For the usual axis z, they are simply x and y.
     """
 
     name: str
@@ -121,8 +121,8 @@ class Joint:
         Raises
         ------
         InvalidTransformError
-            If the position is not finite, has a wrong length, or holds no unit quaternion. The message has the joint's
-            name.
+            If the position is not finite, has a wrong length, or its quaternion is not a unit quaternion. The message
+            has the joint's name.
         TypeError
             If the position has a type that the kind of joint does not accept.
         """
@@ -274,7 +274,7 @@ KNOWN_PARTS = {
 
 REPEATABLE = {"visual", "collision"}
 REQUIRED_ATTRIBUTES = {"parent": "link", "child": "link", "axis": "xyz", "mass": "value"}
-"""Attributes that must be there, although urdf-parser-py does not check it."""
+"""Required attributes that urdf-parser-py does not check."""
 
 XACRO_TAGS = {"arg", "attribute", "call", "element", "if", "include", "insert_block", "macro", "property", "unless"}
 
@@ -297,7 +297,7 @@ class Described(NamedTuple):
 
 
 def read_urdf(source: str | os.PathLike[str]) -> Urdf:
-    """Read the links and joints of a URDF; the source and the errors are those of `read_elements`."""
+    """Read the links and joints of a URDF; the source and the errors are as in `read_elements`."""
     name, elements = read_elements(source)
     links = tuple(each.value.name for each in elements if each.tag == "link")
     return Urdf(name, links, tuple(_joint(each.value, each.label) for each in elements if each.tag == "joint"))
@@ -323,7 +323,7 @@ def read_elements(source: str | os.PathLike[str]) -> tuple[str, list[Described]]
     try:
         from urdf_parser_py import urdf
     except ImportError as error:
-        raise ImportError(f"to read URDF, tfbus needs a package more: {pip_install('urdf')}") from error
+        raise ImportError(f"to read URDF, tfbus needs one more package: {pip_install('urdf')}") from error
     text = source if isinstance(source, str) and "<" in source else Path(source).read_bytes()
     robot = _parse(text)
     if robot.tag != "robot":
@@ -414,7 +414,7 @@ def _check_expanded(robot: Element) -> None:
 
 
 def _parts(robot: Element) -> Iterator[tuple[Element, str]]:
-    """The elements of a robot that are read, each with its label for errors; those without a name are numbered."""
+    """The elements of a robot that are read, each with its label for errors; nameless elements are numbered."""
     seen: Counter[str] = Counter()
     for part in robot:
         if part.tag in READ_ELEMENTS:
@@ -614,7 +614,7 @@ class RobotModel:
     ----------
     name : str
     links : sequence of str
-        The names of the links, which are also those of their frames.
+        The names of the links, and of their frames.
     joints : sequence of Joint
 
     Attributes
@@ -625,9 +625,9 @@ class RobotModel:
     Raises
     ------
     InvalidRobotError
-        If a name occurs twice or is no frame name, a joint has an unknown link, a link has two parents, the links form
-        a loop or have several roots, or a joint mimics an unknown joint, itself over others, or a joint whose position
-        is not one number. The message names the element.
+        If a name occurs twice or is not a frame name; if a joint has an unknown link, a link has two parents, or the
+        links form a loop or have several roots; if a joint mimics an unknown joint, a joint whose position is not one
+        number, or, through others, itself. The message names the element.
 
     Examples
     --------
@@ -712,12 +712,12 @@ class RobotModel:
         authority : str
             The sender.
         prefix : str
-            Put before the names of all frames, such as ``"robot1/"``.
+            A prefix for the names of all frames, such as ``"robot1/"``.
 
         Returns
         -------
         list of TransformStamped
-            First the static ones of the fixed joints, then those of the moving joints.
+            First the static transforms of the fixed joints, then the transforms of the moving joints.
 
         Raises
         ------
@@ -733,7 +733,7 @@ class RobotModel:
         ]
 
     def fixed_transforms(self, stamp: StampLike, authority: str = "", prefix: str = "") -> list[TransformStamped]:
-        """The static ones of `transforms`."""
+        """The static samples of `transforms`."""
         return [
             TransformStamped(prefix + joint.parent, prefix + joint.child, stamp, joint.origin, authority, static=True)
             for joint in self._fixed
@@ -742,7 +742,7 @@ class RobotModel:
     def moving_transforms(
         self, positions: Mapping[str, Position], stamp: StampLike, authority: str = "", prefix: str = ""
     ) -> list[TransformStamped]:
-        """The moving ones of `transforms`."""
+        """The moving samples of `transforms`."""
         return [
             TransformStamped(
                 prefix + joint.parent, prefix + joint.child, stamp, from_row(joint.row(position)), authority
@@ -792,16 +792,16 @@ class RobotModel:
         return found
 
     def unknown_joints(self, names: Iterable[str]) -> list[str]:
-        """The given names that no joint has."""
+        """The names that are not names of joints."""
         return [name for name in names if name not in self._names]
 
     def zeros(self) -> dict[str, Position]:
-        """The zero position of every moving joint that mimics no other."""
+        """The zero position of every moving joint that does not mimic another."""
         return {joint.name: joint.zero for joint in self.joints if joint.kind != "fixed" and joint.mimic is None}
 
 
 def _check_links(model: RobotModel) -> None:
-    """Raise `InvalidRobotError` for a name that occurs twice, or is no frame name."""
+    """Raise `InvalidRobotError` for a name that occurs twice, or is not a frame name."""
     robot = element("robot", model.name)
     if not model.links:
         raise InvalidRobotError("it has no links", element=robot)
@@ -850,7 +850,7 @@ def _root(model: RobotModel) -> str:
 
 
 def _leaders_first(joints: Sequence[Joint]) -> list[Joint]:
-    """Order the joints so that each comes after the one that it mimics; raises `InvalidRobotError` if that fails."""
+    """Order the joints so that each follows the joint that it mimics; raises `InvalidRobotError` if that fails."""
     named = {joint.name: joint for joint in joints}
     ordered: dict[str, Joint] = {}
     for joint in joints:

@@ -26,8 +26,8 @@ class RobotStatePublisher:
     bus : Bus
     model : RobotModel
     prefix : str
-        Put before the names of this robot's frames, such as ``"robot1/"``, so that several robots with the same frames
-        can share a bus. The names of joints have no prefix.
+        The prefix of this robot's frames, such as ``"robot1/"``, so that several robots with the same frames can share
+        a bus. The names of joints have no prefix.
     authority : str
         The sender: shown in errors and tools.
     invalid : {"raise", "drop"}
@@ -38,7 +38,7 @@ class RobotStatePublisher:
     InvalidTransformError
         If the bus refuses a fixed joint, because it would close a loop of parents or belongs to another authority.
     ValueError
-        If the prefix starts with a slash, or `invalid` is neither.
+        If the prefix starts with a slash, or `invalid` has another value.
     BusClosedError, TypeError
     """
 
@@ -66,8 +66,8 @@ class RobotStatePublisher:
     def publish(self, positions: Mapping[str, Position], stamp: StampLike | None = None) -> None:
         """Publish the transforms of the moving joints as one batch.
 
-        Joints without a position of their own or of the joint that they mimic are left out. Unknown joints, and
-        positions outside of the limits, are counted and logged once; nothing is clamped.
+        A joint is left out if neither it nor the joint that it mimics has a position. Unknown joints, and positions
+        outside of the limits, are counted and logged once; nothing is clamped.
 
         Parameters
         ----------

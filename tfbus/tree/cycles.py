@@ -1,20 +1,19 @@
-"""Loops of parents: among the newest edges, where they are refused, and in the past, where they can only be told.
+"""Loops of parents: refused among the newest edges, and announced when late samples form one in the past.
 
 The newest edges of all frames must form a forest. `admit` judges a batch as a whole, so one batch may turn an edge
 round: with ``b`` below ``a``, a batch ``b below r, a below b`` is fine, though ``a below b`` alone would close a loop.
 
-A loop in the past can form although no newest edges ever did. Samples may come late, and an edge holds from its sample
-to its next one::
+A loop in the past can form although the newest edges never form one, because samples may come late. An edge holds from
+its sample to its next sample::
 
     stamp        10      20      30
     a below      b       b       r        (published in order)
     b below      r       r       r
     late: b below a, at 15
 
-At 30 all is well. At 15 to 20 ``a`` is below ``b`` and ``b`` below ``a``: no way leads to ``r``. To refuse the late
-sample would make answers depend on the order of arrival, so it is stored and announced as an event (`past_loop` finds
-it). A lookup at such a stamp takes the way round the loop whose samples cover the stamp: see
-`tfbus.tree.forest.path_at`.
+At 30 all is well. From 15 to 20 ``a`` is below ``b`` and ``b`` below ``a``: no way leads to ``r``. If the late sample
+were refused, answers would depend on the order of arrival. So it is stored, and an event announces the loop
+(`past_loop` finds it). `tfbus.tree.forest.path_at` says which way round the loop a lookup takes.
 
 All walks climb from the frames that are asked for, so their cost depends on the height of the tree, not on its size.
 """
@@ -59,8 +58,8 @@ def admit(
         A child that is neither static nor has a newest stamp counts as having no parent.
     batch : sequence of TransformStamped
     parents : container of str
-        The frames that are a parent of one of the edges; more names do no harm. No loop leads through a frame that is
-        not, so a chain that grows at its end needs no walk up to its root.
+        The parents of the edges; further names do no harm. A loop consists of parents only, so a chain that grows at
+        its end needs no walk up to its root.
     """
     accepted: Sequence[TransformStamped] = batch
     refused: list[InvalidTransformError] = []
@@ -110,7 +109,7 @@ def changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformSt
             edge = edges.get(child)
             stamps[child] = None if edge is None else edge.newest
         newest = stamps[child]
-        # The last kind wins; of moving samples, the newest stamp.
+        # The last kind wins; among moving samples, the newest stamp wins.
         if static or newest is None or stamp >= newest:
             parents[child] = parent
             stamps[child] = None if static else stamp
@@ -118,7 +117,7 @@ def changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformSt
 
 
 def _possibly_looped(changes: Mapping[str, str], parents: Container[str]) -> list[str]:
-    """The changed children, without the childless ones, then without the ones left childless by that, and so on."""
+    """The changed children that may be in a loop: childless ones are removed until every remaining one has a child."""
     children = Counter(changes.values())
     childless = [child for child in changes if child not in parents and child not in children]
     left_out = set(childless)
@@ -201,7 +200,7 @@ def names_below(frames: Frames, names: Iterable[str], above: set[str]) -> set[st
 
 
 def past_loop(frames: Frames, child: str, stamp: int) -> Loop | None:
-    """The loop of parents that the sample of a frame at a stamp is part of, if there is one.
+    """The loop of parents that contains the sample of a frame at a stamp, or None.
 
     The sample holds from its stamp to the next one. An edge counts from its oldest sample on.
     """

@@ -33,11 +33,11 @@ class ExplainedEdge(PlainData):
         The weight of `after` in the answer, 0 to 1: 0 where a sample has the stamp, or where the parent changes at
         `after`. None if the edge is static or does not answer.
     extrapolated_by : int
-        The distance to the sample that stands in, in ns.
+        The distance to the sample that stands in for a missing one, in ns.
     newest : int or None
         The stamp of the newest sample, in ns; None if the edge is static or has none.
     age : float or None
-        How old the newest sample was at the `now` of the explanation, in s; negative if it is ahead of it.
+        The age of the newest sample at `now`, in s; negative if the sample is ahead of it.
     rate : float or None
         Mean samples a second over the window; None for fewer than two.
     authority : str
@@ -81,7 +81,7 @@ class Explanation(PlainData):
     edges : tuple of ExplainedEdge
         One for each two neighbours in the chain, in its order; or in the two half chains, target's first.
     errors : tuple of TransformLookupError
-        All errors that block the answer, among them the one that a lookup raises.
+        All errors that block the answer, among them the error that a lookup raises.
     """
 
     target: str
@@ -122,7 +122,7 @@ class Explanation(PlainData):
         return "\n".join(lines)
 
     def _top(self) -> int:
-        """The number of edges from target up to the common ancestor; those after them lead down to source."""
+        """The number of edges from target up to the common ancestor; the later edges lead down to source."""
         for place, edge in enumerate(self.edges):
             if not self.half_chains and edge.parent == self.chain[place]:
                 return place
@@ -164,7 +164,7 @@ def _aligned(rows: list[list[str]]) -> list[str]:
 
 
 class _Finding(NamedTuple):
-    """The answer of a lookup or its error, and the path, or how far the two ends come."""
+    """The answer of a lookup or its error, and the path; without a path, the frames that each end reaches."""
 
     stamp: int | None
     raised: TransformLookupError | None
@@ -302,7 +302,7 @@ def _block(edge: FrameHistory, at: At, raised: ExtrapolationError, policy: Polic
         except ExtrapolationError as error:
             return error
         return None
-    # `LATEST` waits until the lagging edges reach what the others still hold.
+    # `LATEST` waits until the lagging edges reach the windows of the others.
     if isinstance(raised.stamp, Latest):
         return None if len(edge) else edge.extrapolation_error(LATEST)
     if edge.newest is not None and edge.newest >= raised.stamp - raised.slack:

@@ -8,7 +8,7 @@ that frame can fail or slow a lookup. Runs of static edges are folded into one r
 changes.
 
 The newest edges form no loop, but the edges that hold at an older stamp may (`tfbus.tree.cycles` draws one). Two ways
-then lead round the loop. `path_at` says which of them counts, by the stored samples and never by earlier questions.
+then lead round the loop. `path_at` chooses one by the stored samples, never by earlier questions.
 """
 
 import threading
@@ -38,7 +38,7 @@ class KnownFrames:
     def __init__(self) -> None:
         self._parents_of: dict[str, tuple[str, ...]] = {}
         self._mentions: dict[str, int] = {}
-        # The parents that are no child.
+        # Parents without a parent of their own.
         self._roots: set[str] = set()
         self._sorted: tuple[str, ...] | None = None
         self._some: tuple[str, ...] | None = None
@@ -77,7 +77,7 @@ class KnownFrames:
         self._sorted = self._some = None
 
     def count_after(self, changes: Mapping[str, str]) -> int:
-        """The number of names if the samples of each of these children named this parent, and no other."""
+        """The number of names after `changes`, where the samples of each child name its new parent and no other."""
         more = Counter(changes.values())
         more.subtract(parent for child in changes for parent in self._parents_of.get(child, ()))
         new = [child for child in changes if child not in self._parents_of]
@@ -95,7 +95,7 @@ class KnownFrames:
         return self._sorted
 
     def some(self) -> tuple[str, ...]:
-        """The names for an error, unsorted; of more than `MOST_NAMES`, so many."""
+        """At most `MOST_NAMES` names for an error, unsorted."""
         if self._some is None:
             names = chain(self._mentions, self._parents_of)
             self._some = tuple(dict.fromkeys(islice(names, MOST_NAMES)))
@@ -137,7 +137,7 @@ class Path(Chain):
     permanent : bool
         Whether it holds at every stamp, because no frame on it changes its parent inside its window.
     rival : Path or None
-        The other way round a loop, if the samples cover the stamp on neither of them.
+        The other way round a loop, if the samples of neither way cover the stamp.
     """
 
     __slots__ = ("_changing", "_static", "frames", "moving", "permanent", "rival", "root")
@@ -162,11 +162,11 @@ class Path(Chain):
 
     @property
     def static_stamp(self) -> int:
-        """The newest stamp among the static samples, in ns; sending one again changes it, but not the path."""
+        """The newest stamp among the static samples, in ns. A static sample sent again changes it, but not the path."""
         return max((edge.static_stamp or 0 for edge in self._static), default=0)
 
     def holds(self, at: int) -> bool:
-        """Whether a path by the newest parents has the parents that hold at a stamp."""
+        """Whether the newest parents on this path also hold at a stamp."""
         return all(edge.parent_at(at) == edge.parent for edge in self._changing)
 
     def covers(self, at: int) -> bool:
@@ -174,7 +174,7 @@ class Path(Chain):
         return all(edge.covers(at) for edge in self.moving)
 
     def row_at(self, at: int) -> Row:
-        """The row of source in target at a stamp: that of the kernel or, if it is not plain, the same step by step.
+        """The row of source in target at a stamp, by the kernel, or step by step if the kernel hands it back.
 
         Raises
         ------
@@ -189,7 +189,7 @@ class Path(Chain):
         return row
 
     def newest_common(self) -> tuple[int, FrameHistory]:
-        """The newest stamp that every moving edge has reached, and the edge that has come no further.
+        """The newest stamp that every moving edge has reached, and the edge that lags most.
 
         Raises
         ------
@@ -202,9 +202,9 @@ class Path(Chain):
         return common, next(edge for edge in self.moving if edge.newest == common)
 
     def deciding_error(self, at: int) -> ExtrapolationError:
-        """The error of a stamp that is not covered: of an edge that has lost it, else of the one that lags most.
+        """The error of a stamp that is not covered: of an edge that has dropped it, else of the edge that lags most.
 
-        With a `rival`, of the way that waiting may help.
+        With a `rival`, it is the error of the way that waiting may help.
         """
         return self.with_rival(self._own_error(at), at)
 
@@ -262,7 +262,7 @@ def find_path(frames: Frames, target: str, source: str, at: int | None) -> Path:
 def find_edges(
     frames: Frames, target: str, source: str, at: int | None
 ) -> tuple[list[FrameHistory], list[FrameHistory], str]:
-    """The edges of a path, from source and from target up to the common ancestor, and that.
+    """The edges from source and from target up to the common ancestor, and that ancestor.
 
     It reads nothing but parents, so that it may run while another thread inserts; the caller then has to check whether
     the edges still hold.
@@ -297,8 +297,9 @@ def find_edges(
 def path_at(frames: Frames, target: str, source: str, at: int, newest: Path | None) -> Path:
     """The path that counts at a stamp.
 
-    That is the newest path if all its edges hold and cover the stamp. Otherwise it is the way by the parents that hold
-    at the stamp; of two ways round a loop, the one whose samples cover the stamp. If neither does, it has a `rival`.
+    The newest path counts if all its edges hold and cover the stamp. Otherwise the parents at the stamp make the path.
+    If they form a loop, the path whose samples cover the stamp counts; if neither is covered, the path has the other
+    path as its `rival`.
 
     Parameters
     ----------
@@ -312,43 +313,43 @@ def path_at(frames: Frames, target: str, source: str, at: int, newest: Path | No
     Raises
     ------
     DisconnectedError
-        If there is no way; or if the samples cover the stamp on two ways, and neither is the newest path.
+        If there is no path; or if the samples cover the stamp on two paths, and neither is the newest path.
     """
     if newest is not None and newest.holds(at):
         if newest.root not in frames or newest.covers(at):
             return newest
-        way = newest
+        path = newest
     else:
-        way = find_path(frames, target, source, at)
-    rival, loop = _other_way(frames, way, at)
+        path = find_path(frames, target, source, at)
+    rival, loop = _other_path(frames, path, at)
     if rival is None:
-        return way
+        return path
     if rival.covers(at):
-        if way.covers(at):
-            raise DisconnectedError(target=target, source=source, roots=(way.root, rival.root), stamp=at, loop=loop)
+        if path.covers(at):
+            raise DisconnectedError(target=target, source=source, roots=(path.root, rival.root), stamp=at, loop=loop)
         return rival
-    if way.covers(at):
-        return way
-    if way is newest:
+    if path.covers(at):
+        return path
+    if path is newest:
         # The newest path may be kept for other stamps, at which it has no rival.
-        way = Path(*_edges(frames, way), way.root)
-    elif rival.children < way.children:
+        path = Path(*_edges(frames, path), path.root)
+    elif rival.children < path.children:
         # The same one for both directions of the question.
-        way, rival = rival, way
-    way.rival = rival
-    return way
+        path, rival = rival, path
+    path.rival = rival
+    return path
 
 
-def _other_way(frames: Frames, way: Path, at: int) -> tuple[Path | None, tuple[str, ...]]:
-    """The other way round a loop at a stamp, if its top leads back to it, and the loop."""
+def _other_path(frames: Frames, path: Path, at: int) -> tuple[Path | None, tuple[str, ...]]:
+    """The other path round a loop at a stamp, if its top leads back to it, and the loop."""
     beyond: dict[str, FrameHistory] = {}
-    here = way.root
+    here = path.root
     while (edge := frames.get(here)) is not None and here not in beyond:
         beyond[here] = edge
         here = edge.parent_at(at)
-        if here not in way.frames:
+        if here not in path.frames:
             continue
-        ups, downs = _edges(frames, way)
+        ups, downs = _edges(frames, path)
         for side, other in ((ups, downs), (downs, ups)):
             below = [edge.child for edge in side]
             if here in below:
@@ -406,7 +407,7 @@ class PathCache(Paths):
     Parameters
     ----------
     lock : threading.Lock
-        That of the forest.
+        The lock of the forest.
     """
 
     __slots__ = ("_count", "_older")
@@ -490,7 +491,7 @@ class Forest:
     paths : PathCache
         The newest paths that have been found and are permanent. A change that could make one wrong empties it.
     changing_paths : dict of (target, source) to Path
-        The same of newest paths that are not permanent.
+        The newest paths that have been found and are not permanent.
     changed : set of str
         Frames with another parent or kind, or a longer past, since `forget_changes`: a lookup from a frame below one of
         them may have another answer.
@@ -499,7 +500,7 @@ class Forest:
     looping : list of LoopingSample
         Samples since `forget_changes` that are part of a loop of parents at a past stamp.
     readers : dict
-        The frames that have changed, for each `read_all` that goes on.
+        For each running `read_all`, the frames that have changed since it began.
     expired_samples : list of TransformStamped
         The samples that expired since `forget_changes`.
     replaced, expired : int
@@ -507,7 +508,7 @@ class Forest:
     looped : int
         Number of samples that have been in `looping`.
     structure : int
-        Another number after each change that may make a path wrong.
+        The number of changes that may have made a path wrong.
     """
 
     def __init__(self, window: int | None) -> None:
@@ -557,7 +558,7 @@ class Forest:
             If a sample would close a loop of parents, judged after the whole batch.
         """
         if self.paths.commit(self.frames, self.readers, batch):
-            # Nearly always so: samples that only continue their histories close no loop and change no path.
+            # The usual case: samples that only continue their histories close no loop and change no path.
             return [Outcome.INSERTED] * len(batch)
         with self.lock:
             self.version += 1
@@ -678,7 +679,7 @@ class Forest:
 
         The samples of a whole batch are judged after the last, because one batch may turn an edge round.
         """
-        # Taken before they are judged, so that an error leaves none to be judged again and again.
+        # Emptied first: after an error, no sample may be judged again and again.
         suspects, self._suspects = self._suspects, []
         for sample in suspects:
             child = sample.child
@@ -704,7 +705,7 @@ class Forest:
     # Questions
 
     def search(self, target: str, source: str) -> None:
-        """Find the newest path and keep it, without the lock while it climbs, which may take long.
+        """Find the newest path and keep it. The climb may take long, and runs without the lock.
 
         If a change may have made the path wrong meanwhile, or there is no path, nothing is kept: the lookup that
         follows finds the path, or the error, under the lock.
@@ -766,7 +767,7 @@ class Forest:
             return self.names.sorted()
 
     def some_frames(self) -> tuple[str, ...]:
-        """The frames that an error about an unknown one keeps; see `KnownFrames.some`. Takes the lock."""
+        """The known frames that `UnknownFrameError` keeps; see `KnownFrames.some`. Takes the lock."""
         with self.lock:
             return self.names.some()
 
@@ -807,7 +808,7 @@ class Forest:
                     ahead = list(changed)
             with self.lock:
                 self._read(list(changed), read, found, changed)
-                # A later change is no longer of this moment.
+                # Later changes do not belong to this moment.
                 del self.readers[id(changed)]
         finally:
             self.readers.pop(id(changed), None)
@@ -833,7 +834,7 @@ class Forest:
         return self._copy_of(window, lambda history: history.copy_within(window))
 
     def add_saved(self, saved: SavedFrame) -> None:
-        """Take in a frame that `save_frame` has made of another forest without loops; none of that name is here."""
+        """Add a frame that `save_frame` has read from a forest without loops. This forest has no frame of its name."""
         with self.lock:
             history = self.frames[saved.child] = load_frame(saved, self.window)
             self.names.update(saved.child, history.named_parents)
@@ -878,7 +879,7 @@ class Forest:
         self._drop_emptied_loop(history)
 
     def _drop_emptied_loop(self, history: FrameHistory) -> None:
-        """Drop frames without samples that now stand in a loop: their last parent holds no longer."""
+        """Drop frames without samples that are now in a loop: their last parent no longer holds."""
         walk = {history: None}
         here = history
         while (above := self.frames.get(here.parent)) is not None and above not in walk:
@@ -891,7 +892,7 @@ class Forest:
                     self._remove(edge.child)
 
     def _tell_readers(self, frames: Iterable[str]) -> None:
-        """Tell the threads that read all frames which have changed."""
+        """Tell every running `read_all` which frames have changed."""
         for changed in self.readers.values():
             changed.update(frames)
 

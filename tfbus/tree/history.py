@@ -32,9 +32,9 @@ _begin_of = itemgetter(0)
 
 
 class Runs:
-    """The names that the samples of a history carry, kept once for each run of samples with the same.
+    """The parents, or the authorities, of the samples of a history: one name for each run of samples that share it.
 
-    It is empty, and false, while all samples agree; the history itself holds the name of its newest sample.
+    It is empty, and false, while all samples have the same name. The history holds the name of its newest sample.
     """
 
     __slots__ = ("_runs",)
@@ -87,7 +87,7 @@ class Runs:
         self._close()
 
     def forget_before(self, oldest: int) -> bool:
-        """Forget the names that no sample from a stamp on carries; returns whether there were any."""
+        """Forget the names that only samples before a stamp carry; returns whether there were any."""
         runs = self._runs
         old = 0
         while old + 1 < len(runs) and runs[old + 1][0] <= oldest:
@@ -112,7 +112,7 @@ class Runs:
 
 
 _BLOCK = 64
-"""Up to this many samples for each stamp, all samples are copied at once, which is faster than to pick some."""
+"""Up to this many samples for each stamp, copying all samples is faster than picking some."""
 
 
 class Outcome(Enum):
@@ -298,7 +298,7 @@ class FrameHistory(History):
             self.changed = True
 
     def parent_at(self, stamp: int) -> str:
-        """The parent that holds at `stamp`; outside the window, that of the nearest sample."""
+        """The parent that holds at `stamp`; outside of the window, the parent of the nearest sample."""
         return self._parents.at(stamp) if self.mixed else self.parent
 
     def covers(self, stamp: int) -> bool:
@@ -360,7 +360,7 @@ class FrameHistory(History):
         return self.static or (oldest is not None and oldest <= stamp)
 
     def around(self, stamp: int) -> tuple[int | None, int | None]:
-        """The stamp of the last sample not after `stamp`, and that of the next one, in ns."""
+        """The stamps of the last sample not after `stamp`, and of the next sample, in ns."""
         i, count = self.find(stamp), self.count
         if i < count and self.stamp(i) == stamp:
             i += 1
@@ -447,14 +447,14 @@ class FrameHistory(History):
 
 
 STALE_AFTER = 1.0
-"""s; the age from which pictures show a moving frame as stale unless they are told otherwise."""
+"""In s: the default of the age from which pictures show a moving frame as stale."""
 
 
 class EdgeState(Enum):
     """A state, and the colour of its edges in every picture.
 
-    The colours come from M. Okabe and K. Ito, "Color Universal Design" (2008), which people tell apart with any
-    kind of colour vision.
+    The colours come from M. Okabe and K. Ito, "Color Universal Design" (2008). People with any kind of colour vision
+    can tell them apart.
     """
 
     STATIC = "#0072b2"
@@ -468,7 +468,7 @@ class EdgeState(Enum):
 
 
 def state_of(edge: Edge, now: int, stale_after: float = STALE_AFTER) -> EdgeState:
-    """The state of an edge at the stamp `now` (ns); moving edges are stale after so many s."""
+    """The state of an edge at the stamp `now` (ns); moving edges are stale after `stale_after` s."""
     if edge.static:
         return EdgeState.STATIC
     if edge.newest is None:
@@ -490,11 +490,11 @@ class SavedFrame(NamedTuple):
     rows: npt.NDArray[np.float64]
     """Translation (m) and quaternion (x, y, z, w) of each sample; shape (n, 7)."""
     runs: list[tuple[str, str, int]]
-    """Parent and authority, and how many samples have them one after the other."""
+    """Parent, authority and length of each run of samples that share both."""
 
 
 def save_frame(history: FrameHistory, oldest: int = STAMP_MIN) -> SavedFrame:
-    """The samples of a frame from the stamp `oldest` on, in ns; a static sample has no age."""
+    """The samples of a frame from the stamp `oldest` (ns) on; a static sample is always among them."""
     stamps, rows, origins = _columns(history, oldest, STAMP_MAX)
     first = int(np.searchsorted(stamps, oldest))
     runs = [(parent, authority, len(list(run))) for (parent, authority), run in groupby(origins[first:])]

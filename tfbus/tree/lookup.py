@@ -44,7 +44,7 @@ from tfbus.tree.history import FrameHistory, Samples
 class Hold:
     """Let a sample stand in for the stamps after it, up to the edge's next sample.
 
-    It does so where an edge has no sample after the stamp, or none that `max_gap` lets it interpolate to.
+    It does so where an edge has no sample after the stamp, or where `max_gap` forbids interpolation to that sample.
 
     Parameters
     ----------
@@ -65,9 +65,9 @@ class Policy:
     Parameters
     ----------
     tolerance : int
-        How far the nearest sample may be from a stamp that is not covered, or in a gap that is too long.
+        The greatest distance of a sample that stands in, at a stamp that is not covered or lies in a gap too long.
     max_gap : int or None
-        How far two samples may be apart that are interpolated between; None for any distance.
+        The greatest distance between two samples for interpolation; None for any distance.
     hold : int
         For how long a sample may stand in for the stamps after it.
     """
@@ -83,7 +83,7 @@ class Policy:
 
 
 def policy_of(tolerance: float, max_gap: float | None, extrapolate: Hold | None) -> Policy | None:
-    """The policy that three arguments in s make; None if they allow and refuse nothing.
+    """The policy of a lookup by its three arguments, in s; None if they allow and refuse nothing.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def question_of(
 
 
 class ReadStamp(NamedTuple):
-    """The stamp at which an edge is read in place of the one that was asked, and how far they differ; all in ns."""
+    """The stamp at which an edge is read, its distance from the stamp that was asked, and the gap around it; in ns."""
 
     stamp: int
     extrapolated_by: int
@@ -196,7 +196,7 @@ def read_stamps(edges: tuple[FrameHistory, ...], at: int, policy: Policy) -> lis
     Raises
     ------
     ExtrapolationError
-        Of the deciding edge: the first that waiting cannot help, else the one that lags most.
+        The error of the deciding edge: of the first edge that waiting cannot help, else of the edge that lags most.
     """
     found: list[ReadStamp] = []
     errors: list[ExtrapolationError] = []
@@ -226,7 +226,7 @@ def read_stamps_at_many(samples: Samples, stamps: Stamps, policy: Policy) -> tup
     before, after = own[np.maximum(i - 1, 0)], own[following]
     has_before, has_after = i > 0, i < len(own)
     exact = after == stamps
-    # Unsigned, because two stamps may be further apart than a signed difference can say.
+    # Unsigned, because the distance of two stamps may exceed a signed 64-bit integer.
     late, early, gap = (difference.view(np.uint64) for difference in (stamps - before, after - stamps, after - before))
     between = has_before & has_after & ~exact
     if policy.max_gap is not None:
@@ -245,7 +245,7 @@ def read_stamps_at_many(samples: Samples, stamps: Stamps, policy: Policy) -> tup
 
 
 class Extrapolation:
-    """Reads the edges of one lookup as a policy allows, and records how far that went.
+    """Reads the edges of one lookup as a policy allows, and records the greatest extrapolation and gap.
 
     Attributes
     ----------
@@ -301,7 +301,7 @@ class Bounds(NamedTuple):
 
 
 def bounds_of(not_before: StampLike | None, not_after: StampLike | None) -> Bounds | None:
-    """The bounds that two arguments make; None if they allow every stamp.
+    """The bounds of a `LATEST` lookup by its two arguments; None if they allow every stamp.
 
     Raises
     ------
@@ -405,16 +405,16 @@ def _find_latest(forest: Forest, path: Path, bounds: Bounds | None, extrapolatio
         try:
             return common, path.row_at(common), False
         except ExtrapolationError:
-            # Another way may count there. It is found outside, so that an error keeps no traceback of this one alive.
+            # Another way may count there. It is sought outside, so that its error does not keep this traceback alive.
             pass
     try:
-        way = path
+        chosen = path
         if not path.permanent or path.root in forest.frames:
-            way = forest.find_path(path.frames[0], path.frames[-1], common)
-        row = way.row_at(common) if extrapolation is None else extrapolation.row(way, common)
+            chosen = forest.find_path(path.frames[0], path.frames[-1], common)
+        row = chosen.row_at(common) if extrapolation is None else extrapolation.row(chosen, common)
     except TransformLookupError as error:
-        # The lagging edge has to reach what the others still hold, or the far end of their gap. Where a parent has
-        # changed, any later stamp of it may be enough.
+        # The lagging edge has to reach the windows of the others, or the far end of their gap. Where a parent has
+        # changed, any later stamp of the lagging edge may be enough.
         needed = common + 1
         if isinstance(error, GapError):
             needed = error.after

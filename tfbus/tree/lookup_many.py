@@ -2,13 +2,13 @@
 
 While the forest is locked, `copy_paths` finds the paths that hold between the first stamp and the last, and copies the
 samples on them: as blocks of memory, or only the samples next to a stamp where there are many more samples than stamps.
-The compiled kernel copies nothing, because its blocks can be held. All other work in numpy comes after that, in chunks
-that stay in the cache.
+The compiled kernel copies nothing, because references to its blocks are enough. All other work in numpy comes after
+that, in chunks that stay in the cache.
 
 `Segments` interpolates one edge. It prepares each segment between two samples once, so that a stamp costs one search,
 one sine and one cosine; with fewer stamps than samples it prepares only the segments that are needed.
 
-Where a stamp has no answer, the lookup at that stamp alone raises the error, so that both raise the same one.
+If a stamp has no answer, a single lookup at that stamp raises the error, so both kinds of lookup raise the same error.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -39,8 +39,8 @@ class Segments:
 
     A segment goes from one sample to the next: ``t(s) = t0 + s v`` and ``q(s) = q0 cos(s w) + p sin(s w)``, with s the
     ns since its first sample, and p the unit quaternion a right angle away from q0 on the shorter arc to the next
-    rotation. That is slerp with its two sines resolved (Shoemake 1985, section 3.3). The last sample has a segment of
-    its own, which stays where it is, and so has one that is followed by another parent.
+    rotation. That is slerp with its two sines resolved (Shoemake 1985, section 3.3). The segment that begins at the
+    last sample, or at the last sample before a change of parent, is constant.
     """
 
     def __init__(self, samples: Samples, stamps: Stamps) -> None:
@@ -223,12 +223,12 @@ def plain_columns(forest: Forest, queries: Sequence[Query], with_nan: bool) -> l
     Returns
     -------
     list of array, or None
-        None if an answer is not plain, there is none without `with_nan`, or the kernel gives none at many stamps.
+        None if the kernel cannot answer many stamps, an answer is not plain, or one is missing without `with_nan`.
     """
     if kernel == "python":
-        # Its chains hold nothing, which would be found out after the paths.
+        # Its chains have no `hold`: do not search for the paths first.
         return None
-    held: list[Any] = []
+    snapshots: list[Any] = []
     try:
         with forest.lock:
             for target, source, _ in queries:
@@ -238,11 +238,11 @@ def plain_columns(forest: Forest, queries: Sequence[Query], with_nan: bool) -> l
                     return None
                 # A stamp that this path does not cover may have an answer on another way round a loop of parents.
                 with_nan = with_nan and path.root not in forest.frames
-                held.append(samples)
+                snapshots.append(samples)
     except TransformLookupError:
         return None
     found: list[Floats] = []
-    for samples, (_, _, stamps) in zip(held, queries, strict=True):
+    for samples, (_, _, stamps) in zip(snapshots, queries, strict=True):
         columns = np.empty((7, len(stamps)))
         missing = samples.rows(np.ascontiguousarray(stamps), columns)
         if missing is None or (missing >= 0 and not with_nan):

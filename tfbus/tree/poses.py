@@ -1,8 +1,8 @@
-"""The poses of all frames in one of them: what a picture of the tree needs, and faster than a lookup for each frame.
+"""The poses of all frames in a fixed frame, for pictures of the tree; faster than a lookup for each frame.
 
-The tree is walked from the fixed frame outwards, edges above it upside down, so each edge is read once for each stamp
-at which it is needed, which is usually one. The samples are read under the lock and composed after that. While the
-structure of the tree stays, a picture of the newest samples reads nothing but them.
+The tree is walked from the fixed frame outwards, and the edges above that frame are inverted. Each edge is read once
+for each stamp at which it is needed: usually once. The samples are read under the lock and composed after that. While
+the structure of the tree stays, a picture of the newest samples reads nothing but these samples.
 """
 
 from collections.abc import Sequence
@@ -35,11 +35,11 @@ class Poses(NamedTuple):
     parents: npt.NDArray[np.intp]
     """The place of each frame's parent in `frames`, shape (n,); -1 for a root."""
     answered: npt.NDArray[np.bool_]
-    """Whether a lookup has this answer, shape (n,). Otherwise edges without a sample at the stamp keep their nearest
-    one; the columns are NaN where an edge has no sample at all."""
+    """Whether a lookup gives this pose, shape (n,). If not, an edge that does not cover the stamp is read at its
+    nearest sample; the columns are NaN where an edge has no sample at all."""
     static: npt.NDArray[np.bool_]
     """Whether the edge between each frame and its parent is static, shape (n,); False for a root."""
-    heard: npt.NDArray[np.int64]
+    newest: npt.NDArray[np.int64]
     """The stamp (ns) of the newest sample of each frame, not after the stamp asked for, shape (n,); `STAMP_MIN` for a
     static frame, a root, and where there is none."""
 
@@ -48,12 +48,12 @@ class _Plan(NamedTuple):
     """The order in which the frames are reached from the fixed frame."""
 
     topology: tuple[list[str], list[str]]
-    """All children, and the parent of each."""
+    """All children, and their parents."""
     frames: list[str]
     origins: list[int]
-    """The place of the frame from which each one is reached; its own for the first."""
+    """For each frame, the place of the frame from which the walk reaches it; for the first frame, its own."""
     edges: list[str]
-    """The child of the edge between the two."""
+    """For each frame, the child of the edge by which the walk reaches it."""
     inverted: list[bool]
     parents: npt.NDArray[np.intp]
 
@@ -78,7 +78,7 @@ class PoseReader:
         self.topology: object = None
 
     def read(self, fixed: str, at: int | Latest = LATEST) -> Poses:
-        """The poses in the frame `fixed` at a stamp, or for each frame at the one that `LATEST` means.
+        """The poses in the frame `fixed` at a stamp; with `LATEST`, each frame at its own newest stamp.
 
         Raises
         ------
@@ -104,32 +104,32 @@ class PoseReader:
             return newest, [history.newest_record for history in newest.moving]
 
     def _read_any(self, fixed: str, at: int | Latest) -> Poses:
-        """The poses, whatever stamps and parents the samples have."""
+        """The poses by samples of any stamps and parents."""
         forest = self._forest
         with forest.lock:
             forest.check_known(fixed)
             plan = self._plan(fixed, at)
             histories = [forest.frames.get(child) for child in plan.edges]
             gathered = _gather(plan, histories, at)
-            # A frame may have had another parent at the stamp, or two, by which it was in a loop.
+            # At the stamp, a frame may have had another parent, or two in a loop.
             reparented = any(history.mixed for history in forest.frames.values())
             corrections = [_find(forest, fixed, frame, at) for frame in plan.frames] if reparented else []
-            static, heard = self._own_edges(plan, at)
+            static, newest = self._own_edges(plan, at)
         columns, answered = gathered.compose()
         for place, row in enumerate(corrections):
             answered[place] = row is not None
             if row is not None:
                 columns[:, place] = row
-        return Poses(tuple(plan.frames), columns, plan.parents, answered, static, heard)
+        return Poses(tuple(plan.frames), columns, plan.parents, answered, static, newest)
 
     def _own_edges(self, plan: _Plan, at: int | Latest) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
         """Whether the edge above each frame is static, and its newest stamp."""
         own = [self._forest.frames.get(frame) for frame in plan.frames]
         static = np.array([history is not None and history.static for history in own])
         if isinstance(at, Latest):
-            newest = [STAMP_MIN if history is None else _heard(history.newest) for history in own]
+            newest = [STAMP_MIN if history is None else _stamp_or_least(history.newest) for history in own]
         else:
-            newest = [STAMP_MIN if history is None else _heard(history.around(at)[0]) for history in own]
+            newest = [STAMP_MIN if history is None else _stamp_or_least(history.around(at)[0]) for history in own]
         return static, np.array(newest, np.int64)
 
     def _plan(self, fixed: str, at: int | Latest) -> _Plan:
@@ -171,7 +171,7 @@ def _make_plan(fixed: str, topology: tuple[list[str], list[str]]) -> _Plan:
 
 
 class _Gathered(NamedTuple):
-    """The edges of a plan, each as it is at the stamps at which the frames behind it need it."""
+    """The edges of a plan, each read at the stamps that the frames behind it need."""
 
     plan: _Plan
     rows: bytearray
@@ -179,7 +179,7 @@ class _Gathered(NamedTuple):
     places: list[int]
     """The place of the frame behind each edge."""
     origins: list[int]
-    """For each edge, the index of the one before it on the way from the fixed frame."""
+    """For each edge, the index of the edge before it on the way from the fixed frame."""
     answered: list[bool]
     own: list[int]
     """For each frame, the index of its edge at its own stamp."""
@@ -200,7 +200,7 @@ def _turn_round(rows: npt.NDArray[np.float64], places: npt.NDArray[np.intp]) -> 
 
 
 class _Newest:
-    """The poses of the newest samples, while no edge but those comes or changes.
+    """The poses by the newest samples, as long as the structure of the forest stays.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ class _Newest:
     ----------
     state : object
     moving : list of FrameHistory
-        Their newest records are what `poses` needs.
+        The moving edges; `poses` takes the newest record of each.
     """
 
     def __init__(self, state: object, plan: _Plan, histories: Sequence[FrameHistory | None]) -> None:
@@ -230,7 +230,7 @@ class _Newest:
         self._origins = np.array(plan.origins, np.int64)
         is_moving = {child: place in moving for place, child in enumerate(plan.edges) if place}
         self._static = np.array([not is_moving.get(frame, True) for frame in plan.frames])
-        self._heard = np.array([is_moving.get(frame, False) for frame in plan.frames])
+        self._is_moving = np.array([is_moving.get(frame, False) for frame in plan.frames])
 
     def poses(self, records: Sequence[bytes]) -> Poses | None:
         """The poses; None if the records have several stamps, or an edge has none.
@@ -245,11 +245,11 @@ class _Newest:
         rows[self._places] = block[:, 1:]
         _turn_round(rows, self._upside_down)
         compose_paths(rows, self._origins)
-        heard = np.full(len(self._frames), STAMP_MIN)
+        newest = np.full(len(self._frames), STAMP_MIN)
         if len(stamps):
-            heard[self._heard] = stamps[0]
+            newest[self._is_moving] = stamps[0]
         answered = np.ones(len(self._frames), np.bool_)
-        return Poses(self._frames, rows.T, self._plan.parents, answered, self._static, heard)
+        return Poses(self._frames, rows.T, self._plan.parents, answered, self._static, newest)
 
 
 def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Latest) -> _Gathered:
@@ -316,7 +316,7 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
     return gathered
 
 
-def _heard(stamp: int | None) -> int:
+def _stamp_or_least(stamp: int | None) -> int:
     return STAMP_MIN if stamp is None else stamp
 
 

@@ -135,7 +135,7 @@ def to_dot(edges: Sequence[Edge], now: int | None = None, delays: Mapping[str, f
             style += f', color="{colour}", fontcolor="{colour}"'
         lines.append(f'    {quoted(edge.parent)} -> {quoted(edge.child)} [label="{label}"{style}];')
     for frame in dict.fromkeys(name for edge in edges for name in (edge.parent, edge.child)):
-        # Graphviz would break lines in these, and show what HTML's names of characters stand for.
+        # Graphviz would break lines at such escapes, and decode HTML entities.
         if not frame.isprintable() or "&" in frame:
             lines.append(f"    {quoted(frame)} [label={_label(frame)}];")
     return "\n".join([*lines, "}", ""])
@@ -169,7 +169,7 @@ def _seconds(stamp: int | None) -> str:
 
 
 def quoted(text: str) -> str:
-    """In double quotes as YAML reads it back, and as Graphviz, which knows no ``\\u``, tells names apart."""
+    """In double quotes, as YAML reads it back. Graphviz knows no ``\\u``, but still tells the names apart."""
     result = json.dumps(text, ensure_ascii=False)
     if result.isprintable():
         return result
@@ -181,7 +181,7 @@ def _escaped(code: int) -> str:
 
 
 def _label(text: str) -> str:
-    """In double quotes as Graphviz shows it to people."""
+    """In double quotes, so that Graphviz shows the text to people as it is."""
     return quoted(printable(text).replace("&", "&amp;"))
 
 
@@ -214,7 +214,7 @@ def to_html(
     Returns
     -------
     str
-        One ``<pre>`` element. All names are escaped, one that has control characters too.
+        One ``<pre>`` element. All names are escaped, control characters too.
     """
     drawn = [(guides, frame, printable(frame), edge) for guides, frame, edge in branches(edges)]
     if not drawn:

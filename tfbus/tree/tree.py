@@ -47,9 +47,9 @@ from tfbus.which_kernel import plain_first
 class TransformTree:
     """The transforms between any two frames, over the last few seconds.
 
-    Any thread may read it while another one inserts. A copy, and what `edges` and the texts show, is the tree at one
-    moment; an explanation reads its edges one after the other. A finaliser (``__del__``) or a signal handler must not
-    use it: if it interrupts a call of its own thread that holds the lock of the tree, it would wait for ever.
+    Any thread may read it while another one inserts. A copy, `edges` and the texts show the tree at one moment; an
+    explanation reads its edges one after the other. A finaliser (``__del__``) or a signal handler must not use the
+    tree: if it interrupts a call of its own thread that holds the lock of the tree, it waits for ever.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class TransformTree:
             If it is not a `TransformStamped`.
         """
         if not self._filled_by_bus and isinstance(sample, TransformStamped) and is_within(sample, self.max_translation):
-            # Nearly always so, and much quicker.
+            # The usual case, and much faster.
             return self._forest.insert((sample,))[0]
         return self.insert_many((sample,))[0]
 
@@ -188,7 +188,7 @@ class TransformTree:
         Returns
         -------
         TransformStamped
-            Parent is target and child is source; its stamp is `at`, or the one that `LATEST` found. An answer whose
+            Parent is target and child is source; its stamp is `at`, or the stamp that `LATEST` found. An answer whose
             whole path is static has ``static=True`` and, for `LATEST`, the newest stamp among its samples. In time
             travel, a `LATEST` that only static edges answer takes the stamp of source. With a policy, `extrapolated_by`
             and `gap` say how far the answer departs from its stamp.
@@ -209,10 +209,11 @@ class TransformTree:
 
         Notes
         -----
-        The newest parents never form a loop. Those at an older stamp may, if samples came late, and then two ways lead
-        from source to target. If the way of the newest parents has samples for the stamp, it is the answer; otherwise
-        the way that has them. If both others have them, the frames count as not connected at that stamp. `looped`
-        counts the samples that form such loops. The answer depends on the samples only, never on earlier questions.
+        The newest parents never form a loop. The parents at an older stamp may, if samples came late, and then two ways
+        lead from source to target. If the way by the newest parents has samples for the stamp, it gives the answer;
+        otherwise the way that has samples does. If two other ways have samples, the frames count as not connected at
+        that stamp. `looped` counts the samples that form such loops. The answer depends on the samples only, never on
+        earlier questions.
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         bounds = bounds_of(not_before, not_after)
@@ -251,7 +252,7 @@ class TransformTree:
         Raises
         ------
         TypeError
-            As `lookup`. A lookup without an answer is no error here.
+            As `lookup`. Here, a lookup without an answer is not an error.
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         bounds = bounds_of(not_before, not_after)
@@ -336,9 +337,9 @@ class TransformTree:
         Parameters
         ----------
         cloud : PointCloud
-            With a stamp for each point. If the stamp of the cloud is `LATEST`, that of the newest point is used.
+            With a stamp for each point. If the stamp of the cloud is `LATEST`, the stamp of the newest point is used.
         target : str
-            The frame of the result; often that of the cloud.
+            The frame of the result; often the frame of the cloud.
         fixed : str
             The frame that stands still meanwhile, such as ``"odom"``.
         out_of_range : {"raise", "nan"}
@@ -376,9 +377,9 @@ class TransformTree:
         -------
         TwistStamped
             Its frame is `expressed_in`. For any axes, `linear` is the velocity of the origin of `frame` in m/s;
-            `angular` is the angular velocity in rad/s. At a sample it is the derivative from before; at the first
-            sample of a window or of a new parent, the one from after. Between the last sample with one parent and the
-            first with another, an edge stands still.
+            `angular` is the angular velocity in rad/s. At a sample it is the left derivative; at the first sample of a
+            window or of a new parent, the right derivative. Between the last sample with one parent and the first with
+            another, an edge stands still.
 
         Raises
         ------
@@ -392,8 +393,8 @@ class TransformTree:
         the origin of `frame`, and `do_transform` gives it at another frame of the body. In other axes, as by default,
         the twist does not refer to the origin of its own frame, and `do_transform` would give a wrong velocity.
 
-        tf2's `lookupVelocity` gives other numbers: it rotates a velocity that is in the observer's axes once more by
-        the rotation of the body.
+        tf2's `lookupVelocity` gives other numbers: its velocity is in the observer's axes already, and it rotates it
+        once more, by the rotation of the body.
         """
         axes = reference if expressed_in is None else expressed_in
         if at is not LATEST:
@@ -476,7 +477,7 @@ class TransformTree:
         ------
         UnknownFrameError
         TypeError, ValueError
-            If `at` is no stamp.
+            If `at` is not a stamp.
         """
         stamp = as_stamp(at)
         with self._forest.lock:
@@ -521,7 +522,7 @@ class TransformTree:
         Raises
         ------
         TypeError, ValueError
-            If `stamp` is none.
+            If `stamp` is not a stamp.
         """
         self._check_writable("its samples leave it after `keep` seconds; or use a copy() of the tree")
         self._forest.rebuild(partial(save_frame, oldest=as_stamp(stamp)))
@@ -604,7 +605,7 @@ def forest_of(tree: TransformTree) -> Forest:
 
 
 def window_of(keep: float | None) -> int | None:
-    """The length of history in ns that `keep` in s asks for; None for all of it.
+    """The length of history in ns for `keep` in s; None keeps everything.
 
     Raises
     ------

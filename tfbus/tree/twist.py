@@ -1,8 +1,8 @@
 """The velocity of a frame: the analytic derivative of the interpolation.
 
 Between two samples the origin moves on a straight line at a constant velocity, and slerp turns at a constant angular
-velocity about an axis that stands still in the parent. At a sample the derivative is the one from before; at the first
-sample of a window, or of a new parent, it is the one from after.
+velocity about an axis that stands still in the parent. At a sample, this is the left derivative; at the first sample of
+a window, or of a new parent, the right derivative.
 """
 
 import math
@@ -42,7 +42,7 @@ def twist(forest: Forest, frame: str, reference: str, at: At, axes: str) -> tupl
 
 
 def _common_stamp(forest: Forest, frame: str, reference: str, axes: str) -> int:
-    """The newest stamp at which both the frame and the axes are known; that of static samples if nothing moves."""
+    """The newest stamp at which the frame and the axes are known; if nothing moves, the stamp of static samples."""
     stamp, _, frame_static = find(forest, reference, frame, LATEST, None)
     axes_stamp, _, axes_static = find(forest, axes, reference, LATEST, None)
     if axes_static or frame_static or stamp == axes_stamp:
@@ -51,7 +51,7 @@ def _common_stamp(forest: Forest, frame: str, reference: str, axes: str) -> int:
     try:
         find(forest, reference, ahead_end, common, None)
     except PastExtrapolationError as error:
-        # As on one path, the lagging edge has to reach what the others still hold.
+        # As on one path, the lagging edge has to reach the windows of the others.
         lagging = forest.find_path(reference, lagging_end, LATEST).newest_common()[1]
         raise lagging.extrapolation_error(common if error.oldest is None else error.oldest) from error
     return common

@@ -1,7 +1,7 @@
 """The live 3D page: a `View` serves a page on which people see the frames of a buffer and move through its history.
 
-`page` decides without a browser and without an event loop what a picture shows; `screen` draws it with viser, which
-`server` starts behind a door. Needs ``pip install "tfbus[view]"``.
+`page` decides on the content of a picture, without a browser and without an event loop. `screen` draws it with viser,
+and `server` starts viser behind a door. Needs ``pip install "tfbus[view]"``.
 """
 
 from tfbus.errors import pip_install
@@ -11,6 +11,6 @@ try:
 except ImportError as error:
     if error.name is None or error.name.startswith("tfbus"):
         raise
-    raise ImportError(f"for the live page, tfbus needs some packages more: {pip_install('view')} ({error})") from error
+    raise ImportError(f"for the live page, tfbus needs more packages: {pip_install('view')} ({error})") from error
 
 __all__ = ["View"]

@@ -1,8 +1,8 @@
 """The triangles of visible shapes, and the search for mesh files.
 
-A mesh file comes with a robot that somebody else has described. A few bytes of it can stand for gigabytes: an archive,
-a texture, a scene that repeats a shape. So what it unfolds to is counted before trimesh reads it, and no pixel of a
-texture is decoded, for a shape has one colour.
+A mesh file may come from a stranger. A few bytes of it can stand for gigabytes: an archive, a texture, a scene that
+repeats a shape. So the unfolded size is counted before trimesh reads the file, and textures are not decoded, because a
+shape has one colour.
 """
 
 import io
@@ -25,19 +25,19 @@ from tfbus.plain import printable
 from tfbus.robot.model import Box, Cylinder, Mesh, Shape, Sphere, Visual
 
 MAX_BYTES = 67_108_864
-"""Bytes of a mesh file and of all that it refers to, unpacked."""
+"""The greatest size in bytes of a mesh file and all files that it refers to, unpacked."""
 MAX_NUMBERS = 5_000_000
-"""Numbers of a text, of a scene of COLLADA or of glTF with all that it repeats."""
+"""The greatest count of numbers in a text, or in a scene of COLLADA or glTF with its repetitions."""
 MAX_VERTICES = 2_000_000
 MAX_SHAPES = 10_000
-"""Shapes of one file, with all that it repeats."""
+"""The greatest number of shapes of one file, with repetitions."""
 _KINDS = ("dae", "glb", "gltf", "obj", "off", "ply", "stl", "zae")
 _IMAGES = (".bmp", ".dds", ".gif", ".jpeg", ".jpg", ".ktx2", ".png", ".tga", ".tif", ".tiff", ".webp")
 _SPACE = np.zeros(256, np.bool_)
 _SPACE[list(b' \t\r\n\v\f,;/[]{}:<>="')] = True
 _CHUNK = 1_048_576
 _PLACEHOLDER = 0.05
-"""m; the side of the box that stands for a missing mesh."""
+"""In m: the side of the box that stands for a missing mesh."""
 _PLACEHOLDER_COLOUR = (204, 121, 167)
 _NO_COLOUR = (190, 190, 190)
 
@@ -67,15 +67,15 @@ class MeshFiles:
     Parameters
     ----------
     package_paths : sequence of path
-        Folders in which ``package://NAME/FILE`` is looked for: as ``NAME/FILE``, and if the folder is called NAME, as
-        ``FILE``.
+        Folders in which ``package://NAME/FILE`` is looked for: as ``NAME/FILE``; or as ``FILE``, if the folder is
+        called NAME.
     folder : path
         The folder of the URDF, for relative paths.
 
     Attributes
     ----------
     missing : dict of str to str
-        For each file that could not be used, why.
+        The reason for each file that could not be used.
     """
 
     def __init__(self, package_paths: Iterable[Path], folder: Path) -> None:
@@ -104,7 +104,7 @@ class MeshFiles:
         """
         scheme, place, path, _, _ = urlsplit(filename)
         if scheme == "package":
-            # By its letters: what is a link in a folder may lead out of it, as in every workspace of colcon.
+            # The name is checked, not the file: a symbolic link may leave the folder, as in every colcon workspace.
             inside = os.path.normpath(unquote(path).replace("\\", "/").lstrip("/"))
             if place in ("", ".", "..") or inside.split("/")[0] == ".." or "\0" in inside or ":" in inside:
                 raise FileNotFoundError("the name leaves its package")
@@ -198,7 +198,7 @@ def _read_mesh(path: Path) -> tuple[Triangles, tuple[int, int, int] | None]:
 
 
 class _Files:
-    """The files that trimesh may read beside a mesh: those of its folder, but no images; as a resolver of trimesh."""
+    """A resolver for trimesh: it may read the files in the folder of a mesh, except images."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -219,7 +219,7 @@ class _Files:
     __getitem__ = get
 
     def take(self, path: Path) -> bytes:
-        """The content of a file, if all that were taken are not too much together."""
+        """The content of a file, unless all files taken so far exceed the bound together."""
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1 - self._taken)
         self._taken += len(data)
@@ -233,7 +233,7 @@ def _check(found: int, most: int, what: str) -> None:
 
 
 def _numbers(data: bytes) -> int:
-    """The number of words of a text, each number being one."""
+    """The number of words of a text; each number is one."""
     found = 0
     before = True
     for start in range(0, len(data), _CHUNK):
@@ -244,7 +244,7 @@ def _numbers(data: bytes) -> int:
 
 
 def _is_binary(kind: str, data: bytes) -> bool:
-    """Whether trimesh will take a file for a binary one."""
+    """Whether trimesh will read a file as binary."""
     if kind == "stl":
         return len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
     return kind == "ply" and b"format binary" in data[:1_000]
@@ -259,7 +259,7 @@ def _unpacked(data: bytes) -> bytes:
         if not scenes:
             raise ValueError("its archive has no .dae")
         with archive.open(scenes[0]) as file:
-            # The archive may tell a wrong size.
+            # The archive may claim a wrong size.
             unpacked = file.read(MAX_BYTES + 1)
     _check(len(unpacked), MAX_BYTES, "bytes, unpacked")
     return unpacked
@@ -273,7 +273,7 @@ class _Node:
         self.named: list[str] = []
         self.nested: list[_Node] = []
         self.size: tuple[int, int] | None = None
-        """Shapes and numbers, with all that is repeated."""
+        """The counts of shapes and numbers, with repetitions."""
 
 
 def _check_collada(data: bytes) -> None:
@@ -322,7 +322,7 @@ def _check_collada(data: bytes) -> None:
 
     def size(node: _Node) -> tuple[int, int]:
         if node.size is None:
-            # A node in itself, by whatever way, has no end.
+            # A node that contains itself, directly or through others, has no end.
             node.size = (MAX_SHAPES + 1, 0)
             parts = [(1, numbers.get(name, 0)) for name in node.shapes]
             parts += [size(each) for each in node.nested]
@@ -343,7 +343,7 @@ def _check_collada(data: bytes) -> None:
 
 
 def _check_gltf(data: bytes) -> None:
-    """Refuse a glTF file that unfolds to too much: its counts are claims, and shapes may name the same numbers."""
+    """Refuse a glTF file that unfolds to too much: its counts may be false, and shapes may share numbers."""
     text = data
     if data[:4] == b"glTF":
         (length,) = struct.unpack_from("<I", data, 12)

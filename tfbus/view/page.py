@@ -1,7 +1,7 @@
 """The model of the page: the choices that people make in the browser, and the picture that follows from them.
 
-It knows no browser and no event loop. `Page.picture` reads the tree at the stamp of the `Timeline`: a `Scene`, and the
-trails. `Page.texts` gives the texts of the side panel. Another thread may feed the tree meanwhile.
+It knows no browser and no event loop. `Page.picture` reads a `Scene` and the trails from the tree, at the stamp of the
+`Timeline`. `Page.texts` gives the texts of the side panel. Another thread may feed the tree meanwhile.
 """
 
 import math
@@ -65,7 +65,7 @@ class Timeline:
             self.stamp = min(max(stamp, self.start), self.end)
 
     def play(self) -> None:
-        """Run from the chosen stamp, or from the start if that is the end; while live, nothing happens."""
+        """Run from the chosen stamp, or from the start if the chosen stamp is the end; while live, nothing happens."""
         if self.stamp is not None:
             self.playing = True
             if self.stamp >= self.end:
@@ -76,13 +76,13 @@ class Timeline:
         self.playing = False
 
     def advance(self, elapsed: float) -> None:
-        """Run for so many s of real time, and stop at the end of the span."""
+        """Run for `elapsed` s of real time, and stop at the end of the span."""
         if self.stamp is not None and self.playing:
             self.stamp = min(self.stamp + round(elapsed * self.speed * SECOND), self.end)
             self.playing = self.stamp < self.end
 
     def step(self, forest: Forest, forward: bool) -> None:
-        """Go to the next stamp, or the one before, at which some frame has a sample."""
+        """Go to the next, or the previous, stamp at which some frame has a sample."""
         if self.stamp is None:
             return
         self.playing = False
@@ -107,7 +107,7 @@ def span_of(forest: Forest) -> tuple[int, int] | None:
 def selection_facts(
     tree: TransformTree, fixed: str | None, frame: str, at: int | Latest, now: int, delay: float | None = None
 ) -> dict[str, str]:
-    """The pose of a frame in the fixed frame, and what is known of the edge above it.
+    """The pose of a frame in the fixed frame, and the facts about the edge above it.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def selection_facts(
     Returns
     -------
     dict of str to str
-        By label, in the order in which people want to read them.
+        By label, in the order of display.
     """
     forest = forest_of(tree)
     with forest.lock:
@@ -178,7 +178,7 @@ _NO_POSE = -1
 
 
 class Scene(NamedTuple):
-    """The frames that have a pose in the fixed frame, which comes first; n of them, with m edges between them."""
+    """The n frames that have a pose in the fixed frame, which comes first, and the m edges between them."""
 
     frames: tuple[str, ...]
     positions: Floats
@@ -186,7 +186,7 @@ class Scene(NamedTuple):
     wxyzs: Floats
     """Quaternions (w, x, y, z), shape (n, 4)."""
     colours: Colours
-    """Of each frame's state, shape (n, 3)."""
+    """The colour of each frame's state, shape (n, 3)."""
     states: tuple[EdgeState, ...]
     """The state of the edge above each frame; a root is static."""
     parents: npt.NDArray[np.intp]
@@ -251,7 +251,7 @@ class SceneReader:
         at : int or LATEST
             ns.
         now : int
-            The stamp (ns) that ages are counted from; at a chosen stamp, ages are counted from that.
+            The stamp (ns) that ages are counted from; at a chosen stamp, they are counted from the chosen one.
         selected : str, optional
             The frame whose chain is highlighted.
 
@@ -283,20 +283,20 @@ class SceneReader:
         )
 
     def _codes(self, poses: Poses, now: int) -> npt.NDArray[np.intp]:
-        silent = poses.heard == STAMP_MIN
-        # The age of a silent frame would overflow.
-        stale = now - np.where(silent, now, poses.heard) > self._stale_after
+        silent = poses.newest == STAMP_MIN
+        # The age of a frame without samples would overflow.
+        stale = now - np.where(silent, now, poses.newest) > self._stale_after
         codes = np.where(silent, _SILENT, np.where(stale, _STALE, _MOVING))
         codes = np.where(poses.static | (poses.parents < 0), _STATIC, codes)
         has_pose = np.isfinite(poses.columns)
-        # Nearly always all have one; to ask for each frame takes longer.
+        # The usual case: all have one. Asking for each frame takes longer.
         if not has_pose.all():
             codes[~has_pose.all(axis=0)] = _NO_POSE
         return codes
 
 
 class _Kept:
-    """The parts of a scene that stay while the frames only move: the same arrays, so that they are not sent again."""
+    """The parts of a scene that stay while the frames only move. Their arrays are kept, so they are not sent again."""
 
     def __init__(self, poses: Poses, codes: npt.NDArray[np.intp]) -> None:
         self._poses, self._codes = poses, codes
@@ -313,7 +313,7 @@ class _Kept:
         self.line_colours = np.repeat(self.colours[children][:, None], 2, axis=1)
 
     def holds(self, poses: Poses, codes: npt.NDArray[np.intp]) -> bool:
-        """Whether these poses differ from the first ones in nothing but where the frames are."""
+        """Whether these poses differ from the first ones only in the places of the frames."""
         return (
             poses.frames == self._poses.frames
             and np.array_equal(poses.parents, self._poses.parents)
@@ -360,11 +360,11 @@ def largest_root(forest: Forest) -> str | None:
 
 
 SAMPLES = 300
-"""Points of a trail."""
+"""The greatest number of points of a trail."""
 
 
 def trail(tree: TransformTree, fixed: str, frame: str, at: int | None, duration: float) -> Floats:
-    """The path of a frame in the fixed frame, over so many s before a stamp.
+    """The path of a frame in the fixed frame, over some time before a stamp.
 
     Parameters
     ----------
@@ -492,7 +492,7 @@ class Page:
 
     @property
     def tree(self) -> TransformTree:
-        """The tree that is shown: the live one, or while a stamp is chosen the copy that was made then."""
+        """The tree that is shown: the live tree, or, while a stamp is chosen, a copy from the moment of the choice."""
         return self._tree
 
     @property
@@ -505,7 +505,7 @@ class Page:
         return self._root
 
     def freeze(self) -> None:
-        """Stand still at the newest stamp, on a copy of the history: the live one would forget it after a while."""
+        """Stand still at the newest stamp, on a copy of the history, because the live tree forgets old samples."""
         if self.timeline.stamp is not None:
             self.timeline.pause()
             return
@@ -522,12 +522,12 @@ class Page:
             self._show(self._live_tree)
 
     def play(self) -> None:
-        """Play from the chosen stamp; while live, play the history that there is by now."""
+        """Play from the chosen stamp; while live, play the present history."""
         self.freeze()
         self.timeline.play()
 
     def step(self, forward: bool) -> None:
-        """Stand still at the next sample of any frame, or the one before."""
+        """Stand still at the next, or the previous, sample of any frame."""
         self.freeze()
         self.timeline.step(forest_of(self._tree), forward)
 
@@ -540,7 +540,7 @@ class Page:
         self.selected = frame
 
     def toggle_trail(self) -> None:
-        """Draw the trail of the selected frame, or no longer."""
+        """Show or hide the trail of the selected frame."""
         if self.selected is None:
             return
         if self.selected in self.trails:
@@ -550,7 +550,7 @@ class Page:
 
     def note_event(self, event: Event) -> None:
         """Keep an event to show, from one thread; the oldest are forgotten."""
-        # Another tuple, because another thread may be reading this one.
+        # A new tuple, because another thread may be reading the old one.
         self._events = (event, *self._events[: EVENTS_KEPT - 1])
 
     def picture(self, now: int) -> Picture:
@@ -598,7 +598,7 @@ class Page:
         )
 
     def _tree_text(self, frames: tuple[str, ...], scene: Scene, then: int) -> str:
-        """The tree as HTML, which is long: made anew only if something in it has changed."""
+        """The tree as HTML. It is long, so it is made anew only after a change."""
         key = (frames, scene.frames, scene.states, scene.parents.tobytes(), self.selected)
         if key != self._tree_key:
             self._tree_key = key

@@ -1,11 +1,11 @@
-"""The page in viser: a `Canvas` of frames, a robot's `Solids`, and a `Panel` of what people choose and read.
+"""The page in viser: a `Canvas` of frames, a robot's `Solids`, and a `Panel` of controls and texts.
 
-All axes are one object, and so are all lines; an object in the browser for each frame would stall it at a thousand.
-World poses are computed here, and an object is sent again only if it has changed.
+All axes are one object, and so are all lines, because a browser with an object for each frame stalls at a thousand
+frames. World poses are computed here, and an object is sent again only if it has changed.
 
-All of this, and the `Page` that it shows, belongs to viser's thread: pictures, texts and copies of the tree take tens
-of ms with thousands of frames, for which the program's event loop must not wait. viser's queue of messages also fails
-now and then if another thread fills it while viser's empties it.
+This module and its `Page` run in viser's thread. Pictures, texts and copies of the tree take tens of ms with thousands
+of frames, and the program's event loop must not wait for them. Besides, viser's queue of messages sometimes fails if
+another thread fills it while viser's thread empties it.
 """
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -44,7 +44,7 @@ class Solids:
         self._handles: list[viser.BatchedMeshHandle | None] = [None] * len(self._groups)
         self._drawn: tuple[bool, ...] = ()
         self.opacity = 1.0
-        """Of all shapes, from 0 to 1; 0 hides them."""
+        """The opacity of all shapes, from 0 to 1; 0 hides them."""
 
     def draw(self, scene: Scene) -> None:
         """Move every shape to the pose of its link; shapes of links without a pose are left out."""
@@ -141,7 +141,7 @@ class Canvas:
         """Bring the browsers to a picture, with axes of a length in m."""
         scene, drawn = picture.scene, self._drawn
         self._draw_frames(scene, axes_length)
-        # viser would compare arrays that stay number by number.
+        # Unchanged arrays are not set again, because viser would compare them number by number.
         self._lines.points = scene.lines
         if scene.line_colours is not drawn.scene.line_colours:
             self._lines.colors = scene.line_colours
@@ -155,14 +155,14 @@ class Canvas:
             self._solids.draw(scene)
 
     def add_points(self, name: str, cloud: PointCloud, size: float, colour: Any) -> None:
-        """Add points, or replace those of the same name; they are hidden until they have a pose."""
+        """Add points, or replace the points of the same name; they are hidden until they have a pose."""
         points = cloud.points[np.isfinite(cloud.points).all(axis=1)]
         colours = np.asarray(colour)
         if colours.ndim == 2:
             colours = colours[np.isfinite(cloud.points).all(axis=1)]
         if name not in self._clouds:
             self._clouds_added += 1
-        # A name may have letters that viser's names give a meaning.
+        # A name may contain letters with a special meaning in viser's names.
         node = self._clouds[name].name if name in self._clouds else f"/points/{self._clouds_added}"
         self._clouds[name] = self._server.scene.add_point_cloud(
             node,
@@ -269,7 +269,7 @@ class Panel:
     ----------
     server : viser.ViserServer
     page : Page
-        Changed by what people choose.
+        The choices of people change it.
     controls : Controls
     """
 
@@ -280,7 +280,7 @@ class Panel:
         self._status = gui.add_html("")
         self._fixed = gui.add_dropdown("Fixed frame", (LARGEST,), hint="The frame that stands still")
         self._search = gui.add_text("Search", "", hint="Part of the name of a frame")
-        self._frame = gui.add_dropdown("Frame", (NONE,), hint="The selected frame; those that match the search")
+        self._frame = gui.add_dropdown("Frame", (NONE,), hint="The selected frame, or one that matches the search")
         with gui.add_folder("Selected frame"):
             self._selection = gui.add_html("")
             trail = gui.add_button("Trail on or off", hint="Draw where this frame was in the last ten seconds")
@@ -327,7 +327,7 @@ class Panel:
         _choices(self._frame, NONE, texts.matches, texts.selected)
 
     def show_time(self, chosen: tuple[int, int, int] | None) -> None:
-        """Bring the slider to the chosen stamp of a span, which begins and ends at two others, in ns."""
+        """Move the slider to the chosen stamp: (stamp, begin of the span, end of the span) in ns."""
         self._slider.disabled = chosen is None
         if chosen is not None:
             stamp, start, end = chosen
@@ -372,8 +372,8 @@ class Panel:
 
 
 def _choices(dropdown: viser.GuiDropdownHandle[str], first: str, names: tuple[str, ...], chosen: str | None) -> None:
-    """Offer the names, with the chosen one even if it is none of them."""
-    # A browser takes no option twice.
+    """Offer the names, and the chosen one even if it is not among them."""
+    # A browser does not accept an option twice.
     names = tuple(dict.fromkeys(map(printable, names)))
     options = (first, *(name for name in names if name != first))
     shown = first if chosen is None else printable(chosen)
@@ -433,14 +433,14 @@ class Screen:
         self._texts_due = 0
 
     def draw(self, now: int, elapsed: int, points: Mapping[str, Points], texts: bool = False) -> None:
-        """Change the page as people have chosen, and bring the browsers to it.
+        """Apply the choices of people to the page, and draw it in all browsers.
 
         Parameters
         ----------
         now : int
             The stamp (ns) that ages are counted from.
         elapsed : int
-            A monotonic time, in ns; without a choice, texts are made as often as people can read them.
+            A monotonic time, in ns; unless somebody makes a choice, it limits how often texts are made.
         points : mapping of str to Points
             By name.
         texts : bool
@@ -493,7 +493,7 @@ class Screen:
         self._poses_of_points = {each: pose for each, pose in self._poses_of_points.items() if each in known}
 
     def _pose_of_points(self, points: Points, fixed: str | None) -> Row | None:
-        """The pose of points at their own stamp; that of an instant that has left the history stays as it was."""
+        """The pose of points at their own stamp; once the history has dropped that stamp, the last pose stays."""
         if fixed is None:
             return None
         cloud = points.cloud

@@ -1,8 +1,8 @@
-"""The web server of the page: viser's, without a word on standard output, and with a door in front of it.
+"""The web server of the page: viser's server, silent on standard output, and behind a door.
 
-viser answers any page, sets whatever attribute of a control a message names, and serves as many connections as come.
-Here the head of each request goes through a `WebDoor` before viser sees it, each message through `_Messages`, which
-lets pass what the page itself sends, and `Controls` keeps what people do until the page is drawn.
+viser answers every web page, sets any attribute of a control that a message names, and serves any number of
+connections. Here a `WebDoor` judges the head of each request before viser sees it. `_Messages` lets only those messages
+pass that the page itself sends. `Controls` keeps the changes that people make until the page is drawn.
 """
 
 import asyncio
@@ -26,11 +26,11 @@ from tfbus.statistics import QueueStatistics
 
 _PORTS_TRIED = 100
 MAX_MESSAGE = 65_536
-"""Bytes of a message of a browser."""
+"""The greatest length in bytes of a message of a browser."""
 MAX_TEXT = 1_000
-"""Letters that somebody can type."""
+"""The greatest length of a typed text."""
 MAX_CONNECTIONS = 100
-"""Connections at once; a browser has one for the page, and some while it loads it."""
+"""The greatest number of connections; a browser has one for the page, and more while it loads the page."""
 _MOST = 1e12
 _NEAR = 1e-6
 _console_lock = threading.Lock()
@@ -86,7 +86,7 @@ class _Messages:
                 raise ValueError("it is too long")
             sent = msgspec.msgpack.decode(raw, type=_Value | _Click | _Camera)
             if isinstance(sent, _Camera) and math.dist(sent.position, sent.look_at) < _NEAR:
-                # viser would refuse to move such a camera, and with it the picture of all others.
+                # Such a camera would make viser fail, and stop the picture in all browsers.
                 raise ValueError("it looks nowhere")
             message = self._reader.deserialize(raw)
             if isinstance(sent, _Value):
@@ -103,19 +103,19 @@ class _Messages:
         control: Any = self._server.gui._gui_input_handle_from_uuid[uuid]
         if isinstance(control, viser.GuiSliderHandle):
             if isinstance(value, bool) or not math.isfinite(value):
-                raise ValueError("this is no number")
+                raise ValueError("this is not a number")
             # Browsers round to the step.
             return min(max(float(value), control.min), control.max)
         if isinstance(control, viser.GuiDropdownHandle | viser.GuiButtonGroupHandle):
             if value not in control.options:
-                raise ValueError("this is no option")
+                raise ValueError("this is not an option")
         elif not isinstance(value, bool if isinstance(control, viser.GuiButtonHandle) else str):
-            raise TypeError("this is no value of such a control")
+            raise TypeError("this is not a value of such a control")
         return value
 
 
 class _AtTheDoor(asyncio.Protocol):
-    """A connection whose head is judged before the protocol that serves it is made."""
+    """A connection that judges the head of a request, and only then makes the protocol that serves it."""
 
     def __init__(self, guarded: "_Guarded", make: Callable[[], Any]) -> None:
         self._guarded = guarded
@@ -134,7 +134,7 @@ class _AtTheDoor(asyncio.Protocol):
             self.end()
 
     def connection_lost(self, error: Exception | None) -> None:  # noqa: ARG002 - asyncio's signature
-        """Make room for another one."""
+        """Make room for another connection."""
         self._timer.cancel()
         self._guarded.connections.discard(self)
 
@@ -157,7 +157,7 @@ class _AtTheDoor(asyncio.Protocol):
             return
         served = self._make()
         served.protocol.max_message_size = MAX_MESSAGE
-        # Texts come as bytes too; viser takes them for an error of its own.
+        # viser would raise an error for text messages, so they are passed on as bytes.
         served.recv = partial(served.recv, decode=False)
         lost = served.connection_lost
 
@@ -180,12 +180,12 @@ class _Guarded(viser.infra.WebsockServer):
     refused_connections = 0
 
     def end_connections(self) -> None:
-        """End the connections, which viser ends only as far as it serves them; in viser's thread."""
+        """End all connections, also those that viser does not serve yet; in viser's thread."""
         for connection in self.connections:
             connection.end()
 
     def refuse_connection(self) -> None:
-        """Count a connection for which there is no room; the first is told."""
+        """Count a connection for which there is no room; the first one is logged."""
         self.refused_connections += 1
         if self.refused_connections == 1:
             logging.getLogger("tfbus").warning(
@@ -209,7 +209,7 @@ class _Guarded(viser.infra.WebsockServer):
 
 
 class Server(viser.ViserServer):
-    """viser's server, which no browser can make share the page with the world.
+    """viser's server; no browser can make it share the page on the internet.
 
     Attributes
     ----------
@@ -266,7 +266,7 @@ def start_server(host: str, port: int, door: WebDoor | None = None) -> Server:
     port : int
         The first port to try; 0 for any that is free.
     door : WebDoor, optional
-        By default, one that lets no other pages in.
+        By default, a door that lets no other pages in.
 
     Raises
     ------
@@ -296,7 +296,7 @@ def _furnish(server: viser.ViserServer) -> None:
     server.gui.main_panel.dock_right()
     server.gui.set_panel_label("tfbus")
     scene = server.scene
-    # viser's picture of a sky takes long to load, and to light a scene with where there is no graphics card.
+    # viser's picture of a sky takes long to load, and without a graphics card, lighting by it is slow.
     scene.configure_environment_map(None)
     scene.configure_default_lights(cast_shadow=False)
     scene.add_light_ambient("/light", intensity=1.5)
@@ -340,8 +340,8 @@ CAPACITY = 12
 class Controls:
     """The changes that people made on the page since it was drawn last; of each control, the newest value counts.
 
-    It belongs to viser's thread: viser calls `use` there, and the page is changed there when it is drawn. So a flood
-    of messages costs the program's event loop one wake-up a picture, whatever they change.
+    It belongs to viser's thread: viser calls `use` there, and drawing applies the changes there. So even a flood of
+    messages costs the program's event loop only one wake-up a picture.
 
     Parameters
     ----------
@@ -359,19 +359,19 @@ class Controls:
         self._waker.bind()
 
     def use(self, control: object, change: Callable[[], object]) -> None:
-        """Have a change made when the page is drawn next, instead of an earlier one by the same control."""
+        """Keep a change for the next drawing of the page; it replaces an earlier one by the same control."""
         self._conflated += self._waiting.pop(control, None) is not None
         self._waiting[control] = change
         self.wake()
 
     def wake(self) -> None:
-        """Have the page drawn; for any thread."""
+        """Request a drawing of the page; for any thread."""
         # The event loop may have ended before the server.
         with suppress(RuntimeError):
             self._waker.wake()
 
     def apply(self) -> bool:
-        """Make the changes in the order in which they came; whether there were any."""
+        """Make the changes in the order in which they came; return whether there were any."""
         waiting, self._waiting = self._waiting, {}
         for change in waiting.values():
             try:

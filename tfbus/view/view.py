@@ -1,7 +1,8 @@
 """`View`, the live 3D page of a bus.
 
-The program's event loop decides when to draw, and waits; viser's thread changes the page as people have chosen, reads
-the tree and draws. What browsers send costs the loop one wake-up a picture, and pictures take at most half of the time.
+The program's event loop decides when to draw, and waits. viser's thread applies the choices of people, reads the tree
+and draws. All messages of browsers together cost the loop one wake-up a picture, and pictures take at most half of the
+time.
 """
 
 import logging
@@ -44,30 +45,30 @@ _FEW = 100
 _DELAYS_EVERY = 500_000_000
 """ns."""
 _AT_LEAST_EVERY = 0.5
-"""s; ages and stale frames change without any sample."""
+"""In s: the longest time between two pictures, because ages and stale frames change without any sample."""
 
 
 class View:
     """A page in the browser that shows the frames of a buffer: ``async with View(bus, buffer) as view``.
 
-    It shows the axes of every frame that is connected with the fixed frame, a line to its parent in the colour of its
-    state, and in a panel what is known of the selected frame, the tree, and what happens. Time can be stopped, moved
-    and played. All browsers show the same page. While no browser shows it, it draws nothing and listens to nothing.
+    It shows the axes of every frame that is connected with the fixed frame, and a line to its parent in the colour of
+    its state. A panel shows the facts about the selected frame, the tree, and events. Time can be stopped, moved and
+    played. All browsers show the same page. While no browser shows it, it neither draws nor listens.
 
     Parameters
     ----------
     bus : Bus
     buffer : Buffer
-        Its history is what the page can go back to. The frames have the names of the bus.
+        The page can go back in its history. The frames have the names of the bus.
     port : int
-        The port of the page, or the next one that is free; 0 for any.
+        The port of the page; if it is taken, the next free one; 0 for any.
     host : str
         The address to listen at. By default, only programs on this machine can connect; each program that can connect
         sees and controls the page.
     origins : iterable of str
-        Web pages that may use this one beside itself, such as ``https://robot.example:8443``; the page answers to the
-        names of their hosts too. By default there are none, and it answers to addresses, to ``localhost``, to ``host``
-        and to the name of this machine. ``*`` stands for all.
+        Other web pages that may use this one, such as ``https://robot.example:8443``; the page also answers to the
+        names of their hosts. By default there are none, and it answers to addresses, to ``localhost``, to ``host`` and
+        to the name of this machine. ``*`` stands for all.
     fixed : str, optional
         The frame that stands still; by default the root of the largest tree. It can be changed on the page.
     trails : iterable of str
@@ -77,7 +78,7 @@ class View:
     package_paths : iterable of path
         Folders in which the ``package://`` of its meshes are looked for.
     rate : float
-        The page is drawn at most so many times per s.
+        The page is drawn at most this many times per s.
     live : bool
         Whether the page starts with the newest samples. Otherwise it is for a recording: it starts at the oldest.
     stale_after : float
@@ -91,9 +92,9 @@ class View:
     Raises
     ------
     ValueError
-        If the port, the rate or `stale_after` is out of range, or an origin has not the form of one.
+        If the port, the rate or `stale_after` is out of range, or an origin is malformed.
     InvalidTransformError
-        If a frame has a name that no frame can have.
+        If a name cannot be the name of a frame.
     OSError, InvalidRobotError, ImportError
         On entering, if the address cannot be listened at, or the URDF cannot be read.
     BusClosedError, RuntimeError
@@ -163,22 +164,22 @@ class View:
     ) -> None:
         """Show points in their frame, instead of earlier points of the same name.
 
-        Points with a stamp are where their frame was then, seen from the fixed frame; those with the stamp `LATEST`
-        move with their frame. They are hidden until there is a transform.
+        Points with a stamp are shown at the pose that their frame had then in the fixed frame; points with the stamp
+        `LATEST` move with their frame. Points are hidden until there is a transform.
 
         Parameters
         ----------
         cloud : PointCloud
         name : str
         size : float
-            Of each point, in m.
+            The size of each point, in m.
         colour : (int, int, int) or integer array of shape (n, 3)
-            Red, green and blue from 0 to 255, of all points or of each.
+            Red, green and blue from 0 to 255, for all points or for each.
 
         Raises
         ------
         TypeError, ValueError
-            If the cloud is none, the size is not greater than zero, or the colour has another shape.
+            If `cloud` is not a cloud, the size is not greater than zero, or the colour has another shape.
         """
         if not isinstance(cloud, PointCloud):
             raise TypeError(f"expected a PointCloud, not {cloud!r}")
@@ -186,7 +187,7 @@ class View:
             raise TypeError(f"a size must be a number of m, not {size!r}")
         if not 0.0 < size < float("inf"):
             raise ValueError(f"a size must be greater than zero and finite, got {size!r}")
-        # Another dict, because viser's thread may be reading this one.
+        # A new dict, because viser's thread may be reading the old one.
         self._points = {**self._points, name: Points(cloud, float(size), _as_colours(colour, len(cloud)))}
         self._changed.set()
 
@@ -210,12 +211,12 @@ class View:
 
     @property
     def refused(self) -> int:
-        """Requests of other pages, messages that this one does not send, and connections beyond 100 at once."""
+        """Refused: requests of other pages, messages that this page does not send, connections beyond 100 at once."""
         server = self._server
         return self._door.refused + (server.refused + server.refused_connections if server is not None else 0)
 
     def statistics(self) -> QueueStatistics:
-        """The counters of what people do on the page; of each control, a picture shows the newest value."""
+        """The counters of people's changes on the page; of each control, a picture shows the newest value."""
         return self._controls.statistics()
 
     async def __aenter__(self) -> Self:
@@ -279,7 +280,7 @@ class View:
                 await self._changed.wait()
 
     async def _show(self) -> None:
-        """Draw until nobody looks any more."""
+        """Draw until no browser shows the page."""
         async with anyio.create_task_group() as tasks:
             with self._listening():
                 tasks.start_soon(self._note_events)
@@ -326,7 +327,7 @@ class View:
 
     @contextmanager
     def _listening(self) -> Iterator[None]:
-        """Redraw when samples arrive or frames go, for the body of a ``with``; a closed bus has nothing new."""
+        """Redraw when samples arrive or frames are removed, for the body of a ``with``; not on a closed bus."""
         delays = Delays()
         due = 0
         self._page.delays = delays.by_frame
@@ -334,7 +335,7 @@ class View:
         def arrived(batch: Batch) -> None:
             nonlocal due
             now = time.monotonic_ns()
-            # Of many frames, the delays of some batches are enough for people.
+            # With many frames, the delays of some batches are enough.
             if len(batch) <= _FEW:
                 delays.note(batch, self.bus.clock.now())
             elif now >= due:
@@ -360,7 +361,7 @@ class View:
         with self.bus.events(stale_after=self._stale_after) as events:
             async for event in events:
                 if known and isinstance(event, FrameAdded):
-                    # It begins with the frames that are there already.
+                    # The events begin with the frames that exist already.
                     known -= 1
                     continue
                 self._page.note_event(event)

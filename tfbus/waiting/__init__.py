@@ -1,4 +1,4 @@
-"""Waiting lookups and open watches: an insertion finds the ones that it concerns without looking at the others.
+"""Waiting lookups and open watches: an insertion finds the affected ones without a look at the others.
 
 There is no event loop here: each waiter brings along the function that wakes it.
 """

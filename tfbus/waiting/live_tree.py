@@ -6,10 +6,10 @@ A lookup that cannot be answered is parked under the frame that blocks it, and a
   an edge to 12.5 s takes all lookups up to 12.5 s off the end of that list, and sees no other;
 * under an unknown frame, or under the roots of two trees: any sample of these frames wakes the lookup.
 
-A lookup also ends when another edge of its path loses the stamp, because the window of that edge has slid on. Each edge
-has a limit: the newest stamp that it may reach until then. A waiter is kept by its first limit in one list for all
-frames, so an insertion costs one comparison while no limit is passed. Once some frame has passed a limit, the waiter is
-kept under each edge that has not, such as one that has stopped.
+A lookup also ends when the window of another edge on its path moves past the stamp. So each edge has a limit: a sample
+newer than the limit drops the stamp. One list for all frames holds the first limit of each waiter, so an insertion
+costs one comparison while no limit is passed. Once a frame has passed the first limit of a waiter, that waiter is kept
+under each edge whose limit is not yet passed, such as an edge that has stopped.
 
 `LiveTree.insert` pops the waiters that may have an answer now and wakes them, each with its answer if that is plain. To
 wake a waiter is to call the function that it brought along: nothing here knows an event loop, and nothing waits.
@@ -48,7 +48,7 @@ Limits = list[tuple[str, int]]
 
 
 def limits_of(forest: Forest, question: Question, blocking: str | None) -> Limits:
-    """The moving edges of a question, each with a limit in ns: a newer sample of it may mean that no answer will come.
+    """The moving edges of a question, each with a limit in ns: a sample newer than it may make an answer impossible.
 
     An edge that keeps all samples has no limit. Neither has a lookup at `LATEST`, because its stamp is never too old.
     Only the thread that fills the forest may call this.
@@ -86,7 +86,7 @@ def _limits_at(
             continue
         before, after = edge.around(at)
         if before is None:
-            # The first sample decides, or has decided.
+            # The first sample decides.
             limit = at
         elif after is not None:
             # Until the sample before the stamp leaves the window.
@@ -152,7 +152,7 @@ class Waiter(Parked):
     wake : callable
         Called once, after the waiter was popped from the index.
     others : tuple of Question
-        Questions whose answers are needed as well: if one of them can have no answer any more, the waiter is woken.
+        Further questions that need an answer: the waiter is woken when one of them can no longer have an answer.
 
     Attributes
     ----------
@@ -239,7 +239,7 @@ class WaitingIndex:
     Attributes
     ----------
     by_frame : dict of str to Line
-        The waiters under each frame that blocks a lookup, or whose next sample may make one hopeless.
+        The waiters under each frame that blocks a lookup, or that may make one hopeless by its next sample.
     parked : dict of Waiter to None
         All waiters in the order in which they came.
     limits : list of (-stamp, -order, Waiter)
@@ -249,8 +249,8 @@ class WaitingIndex:
     def __init__(self) -> None:
         self.by_frame: dict[str, Line] = {}
         self.parked: dict[Waiter, None] = {}
-        # Brought up to date when it is read, because the blocking edge wakes most waiters. `indexed` marks a waiter
-        # that is in it.
+        # Updated only when it is read, because most waiters are woken by the blocking edge before. `indexed` marks a
+        # waiter that is in it.
         self._by_name: dict[str, dict[Waiter, None]] = {}
         self.limits: list[Place] = []
         self._passed = STAMP_MIN
@@ -266,7 +266,7 @@ class WaitingIndex:
 
     @property
     def limit(self) -> int:
-        """A sample at a newer stamp (ns) may have made a waiter hopeless, whatever its frame."""
+        """The first limit of all waiters, in ns: a newer sample of any frame may have made a waiter hopeless."""
         return -self.limits[-1][0] if self.limits else _NEVER
 
     def park(self, waiter: Waiter, error: TransformLookupError, limits: Iterable[tuple[str, int]] = ()) -> None:
@@ -287,7 +287,7 @@ class WaitingIndex:
         waiter.names = blocking_frames(error)
         cause = error.__cause__
         if isinstance(cause, (*MAY_COME, GapError)):
-            # At the newest common stamp something else is missing as well; late data may bring it.
+            # At the newest common stamp another sample is missing as well; late data may bring it.
             also = (cause.child,) if isinstance(cause, GapError) else blocking_frames(cause)
             waiter.names = tuple(dict.fromkeys((*waiter.names, *also)))
         waiter.blocked_by = error
@@ -340,9 +340,8 @@ class WaitingIndex:
     def pop_unblocked(self, frame: str, stamp: int | None) -> list[Waiter]:
         """Remove and return the waiters that a sample of `frame` at `stamp` may have unblocked or made hopeless.
 
-        These are the waiters that need any sample, that need this stamp or an older one, or whose limit for this frame
-        is older. No waiter needs a stamp older than the newest sample, so a late sample unblocks no
-        others.
+        These waiters need any sample, or this stamp or an older one, or have an older limit for this frame. No waiter
+        needs a stamp older than the newest sample, so a late sample unblocks no others.
         """
         blocked = self.by_frame.get(frame)
         if blocked is None:
@@ -366,7 +365,7 @@ class WaitingIndex:
         return ready
 
     def pop_limited(self, stamp: int) -> list[Waiter]:
-        """Take the first limit from the waiters, still parked, for which it is older than `stamp`; return them."""
+        """Take the first limit from each waiter whose limit is older than `stamp`; return these, which stay parked."""
         self._passed = max(self._passed, stamp)
         limits = self.limits
         found = []
@@ -401,7 +400,7 @@ class WaitingIndex:
         return ready
 
     def forget(self, waiter: Waiter) -> None:
-        """Forget a waiter, but for the frames that block it."""
+        """Forget a waiter, except under the frames that block it."""
         try:
             if waiter.limit is not None:
                 _discard(self.limits, waiter.limit)
@@ -417,7 +416,7 @@ class WaitingIndex:
                             del self._by_name[name]
                 waiter.indexed = False
         finally:
-            # Even if there is no memory for the rest, which is then forgotten when its turn comes.
+            # First, because memory may run out below; the rest is then forgotten when its turn comes.
             self.parked.pop(waiter, None)
 
     def _index(self) -> dict[str, dict[Waiter, None]]:
@@ -430,7 +429,7 @@ class WaitingIndex:
         return self._by_name
 
     def _forget_limits(self, waiter: Waiter) -> None:
-        """Take a waiter from under the edges that it is kept under by limit."""
+        """Remove a waiter from under each edge that has a limit for it."""
         for frame, place in waiter.limits:
             blocked = self.by_frame.get(frame)
             if blocked is not None:
@@ -487,8 +486,8 @@ class LiveTree:
     last_reset : ClockResetError or None
         The last jump back of the clock; a new object for each.
     tell_expired : callable
-        Called with a sample that has expired, the newest stamp of its frame, in ns, and the authority of that. Returns
-        whether that stamp is ahead of the clock. The bus sets it.
+        The bus sets it. Called with a sample that has expired, and with the stamp (ns) and the authority of its frame's
+        newest sample; returns whether that stamp is ahead of the clock.
     expired_ahead, superseded : int
         As in `BufferStatistics`; the bus counts the superseded ones.
     feed : Feed or None
@@ -528,7 +527,7 @@ class LiveTree:
             self.insert_closely(batch)
 
     def insert_closely(self, batch: Batch) -> None:
-        """As `insert`, for a batch that the feed has left alone because it is not plain."""
+        """As `insert`, for a batch that the feed has handed back because it is not plain."""
         waiters = self._waiters
         plain = self.forest.commit(batch)
         if waiters or self.waiting.limits:
@@ -596,7 +595,7 @@ class LiveTree:
             try:
                 callback()
             except Exception as error:
-                logging.getLogger("tfbus").warning("what was to be called at the end raised", exc_info=error)
+                logging.getLogger("tfbus").warning("a callback at the end of a buffer raised", exc_info=error)
 
     def on_end(self, callback: Callable[[], object]) -> Registration:
         """Register a function for `call_end_callbacks`, or call it now if the end has come."""

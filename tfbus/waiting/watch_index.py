@@ -1,7 +1,7 @@
 """An index of the open watches by the frames of their answers.
 
-A watch that has an answer is kept under the frames on the path of the answer, so an insertion finds the watches that it
-concerns without looking at the others. It only marks them as outdated: the reader of a watch computes the new answer.
+A watch that has an answer is kept under the frames on the path of the answer, so an insertion looks only at the watches
+that it concerns. It only marks them as outdated: the reader of a watch computes the new answer.
 """
 
 from collections.abc import Callable, Iterable
@@ -33,7 +33,7 @@ class WatchState:
     waiting : bool
         Whether a task waits to be woken.
     frames : frozenset of str
-        The frames that the index keeps it under.
+        The frames under which the index keeps this watch.
     path : Path or None
         The path of the answer, if it is a permanent one.
     """
@@ -107,7 +107,7 @@ class WatchIndex:
         self._move(state, frozenset())
 
     def mark(self, frames: Iterable[str]) -> list[WatchState]:
-        """Mark the watches under some frames as outdated; return the ones that were up to date, to be woken."""
+        """Mark the watches under some frames as outdated; return the newly outdated ones, to be woken."""
         touched: dict[WatchState, None] = {}
         for frame in frames:
             states = self.by_frame.get(frame)
@@ -126,7 +126,7 @@ class WatchIndex:
         return {name for state in asking for name in (state.target, state.source)}
 
     def mark_asking_for(self, frames: set[str]) -> list[WatchState]:
-        """Mark the watches of some frames that have no permanent path; return the ones that were up to date.
+        """Mark the watches of some frames that have no permanent path; return the newly outdated ones.
 
         Late samples can form a loop at the stamp of an answer. Then an edge beyond the path may open another path.
         """

@@ -111,7 +111,7 @@ def test_a_recording_without_transforms_has_no_table(tmp_path: Path, tfbus: Comm
         (None, "there is no such file"),
         (b"", "the file is empty"),
         (b"\x89MCAP0\r\n\x01", "the file ends before its first message"),
-        (b"Dear diary,\n", "it is no recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)"),
+        (b"Dear diary,\n", "it is not a recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)"),
         (b"#ROSBAG V2.0\n", "the file ends before its first message"),
     ],
     ids=["missing", "empty", "truncated", "foreign", "truncated bag"],

@@ -126,7 +126,7 @@ def test_an_unfinished_recording_is_played_as_far_as_it_goes(tmp_path: Path, tfb
     done, received = play(tfbus, path)
     assert done.returncode == 0
     first, *_, played, left_out = done.stderr.splitlines()
-    assert first == f"tfbus: {path} is cut, or its writer did not finish it: this is what can be read"
+    assert first == f"tfbus: {path} is cut, or its writer did not finish it: playing its readable part"
     assert played.startswith("1 samples in 1 messages played")
     assert left_out == "tfbus: left out: 1 x unfinished"
     assert received == [moving("map", "base", 1)]

@@ -123,7 +123,7 @@ def test_it_says_what_it_could_not_see_within_five_seconds(tfbus: Command) -> No
     assert json.loads(done.stdout)["stamp"] == START + 5 * SECOND
     assert done.stderr.splitlines() == [
         "one sample only, so the rate is not known: laser",
-        "6 trees, below root0, root1, root2, root3, root4 and 1 more: what connects them was not sent meanwhile",
+        "6 trees, below root0, root1, root2, root3, root4 and 1 more: no edge between them was sent meanwhile",
     ]
     # A duration that is given is kept.
     assert json.loads(tfbus.on_domain(publish_once, "tree", "--json", "--duration", "2").stdout)["stamp"] == (

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from support.processes import OPEN_FILES, Program, free_address, until
 from support.zenoh_wires import LIVE, Ear, listening, met, start_router, talk
 
-from tfbus.links.wire import MAX_MESSAGE, Hearing, Joined, Left
-from tfbus.links.zenoh.addresses import client_config, open_client
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left
+from tfbus.links.zenoh.sessions import client_config, open_client
 from tfbus.links.zenoh.wire import ZenohWire
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
 from tfbus.tf_message import MalformedMessageError
@@ -343,7 +343,7 @@ class Stoppable:
 
 _LINK = """
 import sys, anyio
-from tfbus.links.wire import Hearing
+from tfbus.links.seams import Hearing
 from tfbus.links.zenoh.wire import ZenohWire
 async def main(domain, which, address):
     wire = ZenohWire(domain, lease=1.0, **{which: address})
@@ -486,7 +486,7 @@ print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 async def test_a_program_may_exit_without_closing_its_wire(address: str, domain: str) -> None:
     program = f"""
 import anyio
-from tfbus.links.wire import Hearing
+from tfbus.links.seams import Hearing
 from tfbus.links.zenoh.wire import ZenohWire
 async def main():
     wire = ZenohWire("{domain}", connect="{address}")

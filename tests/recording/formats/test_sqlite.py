@@ -305,6 +305,6 @@ def test_timestamps_that_are_no_integers_are_counted(path: Path) -> None:
             file.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (2, ?, ?)", (received, b""))
     *messages, lost = messages_in(path)
     assert [(message.received, message.batch) for message in messages] == IN_ORDER
-    assert "5 messages have a timestamp that is no integer" in str(lost.errors[0])
+    assert "5 messages have a timestamp that is not an integer" in str(lost.errors[0])
     with open_recording(path) as recording:
         assert facts(recording) == (5, 40, 4, True)

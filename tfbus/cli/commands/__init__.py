@@ -1,1 +1,1 @@
-"""The subcommands of ``tfbus``, one module each; those of the tutorial share one."""
+"""The subcommands of ``tfbus``, one module each; the subcommands of the tutorial share a module."""

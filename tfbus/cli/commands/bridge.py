@@ -27,8 +27,8 @@ def bridge(
     of rmw_zenoh, ws://host:9090 for a rosbridge server of ROS 1 or ROS 2, or the name of a domain; domain:dds is a
     domain of that name. Several bridges in a ring pass each sample on once.
 
-    A domain is that of this machine, or with --listen or --connect the one behind the router. To bridge the two, name
-    the domain twice.
+    Without --listen and --connect, a domain is the one on this machine; with them, the one behind the router. To bridge
+    these two, name the domain twice.
 
     Example: tfbus bridge tf dds
 
@@ -51,7 +51,7 @@ def bridge(
         if one.ros or not (listen or connect):
             raise UsageError(f"a bridge needs two places, not {first!r} twice")
         one = LinkOptions(one.domain, backend=backend)
-        names = f"{one.place} {one.way}", f"the same {other.way}"
+        names = f"{one.place} {one.route}", f"the same {other.route}"
     elif one.listen and other.listen:
         # Its router is in this program already.
         one = replace(one, listen=(), connect=tuple(map(_reachable, listen)))
@@ -71,5 +71,5 @@ def _options(place: str, listen: tuple[str, ...], connect: tuple[str, ...], back
 
 
 def _reachable(address: str) -> str:
-    """The address of a router of this program for this program."""
+    """The address at which this program reaches its own router."""
     return address.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")

@@ -42,10 +42,10 @@ def check(
     topics: TopicOptions = DEFAULT_TOPICS,
     link: LinkOptions = DEFAULT_LINK,
 ) -> int:
-    """Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.
+    """Find faults in a recording, or in a domain for some time: which, when, how often, and what to do.
 
-    The exit status is 0 if nothing is wrong and 1 if something is; a recording that is cut, or that its writer did not
-    finish, is wrong as well. A frame that never moves is only a hint.
+    The exit status is 0 if nothing is wrong and 1 if something is, such as a recording that is cut or unfinished. A
+    frame that never moves is only a hint.
 
     Example: tfbus check run.mcap
 

@@ -51,20 +51,20 @@ def compare(
     Parameters
     ----------
     reference
-        The recording that counts as true.
+        The recording that is taken as the truth.
     estimate
         The recording to judge.
     pair
         As TARGET:SOURCE, the frames whose transform is compared; may be given several times. By default, every frame
         that moves in both recordings, in its parent.
     scale
-        Scale the estimate as well where it is aligned.
+        When the estimate is aligned, scale it as well.
     max_difference
         The greatest difference of two stamps that are compared, in s.
     delta
         The number of poses of each step for the relative error.
     as_csv
-        Print the errors over time: m and rad, without alignment; the relative ones are empty where no step ends.
+        Print the errors over time, in m and rad, without alignment; a relative error is empty where no step ends.
     as_json
         Print a JSON object instead.
     """

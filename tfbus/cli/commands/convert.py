@@ -31,8 +31,8 @@ def convert(
 ) -> None:
     """Write recordings to a new one: in another format, a part of them, renamed, or several merged by their log times.
 
-    The last file is the new one. Transforms keep every bit; messages on other topics are passed through as they are, or
-    converted between ROS 1 and ROS 2 where the format needs it.
+    The last file is the new one. Transforms keep every bit; messages on other topics are copied unchanged, or converted
+    between ROS 1 and ROS 2 if the format needs it.
 
     Example: tfbus convert run.bag run.mcap --from 10 --to 20 --rename base_link=base
 
@@ -54,7 +54,7 @@ def convert(
     rename
         As OLD=NEW, another name for a frame; may be given several times.
     prefix
-        Put this before the names of all other frames.
+        A prefix for the names of all other frames.
     drop_static
         Leave out static transforms.
     static_to_yaml

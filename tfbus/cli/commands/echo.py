@@ -19,7 +19,7 @@ from tfbus.waiting.live_tree import blocking_frames
 _Cause = tuple[type[BaseException], tuple[str, ...]]
 
 _TIMEOUT = 1.0
-"""s; a transform that is only late is not reported as missing."""
+"""In s: how late a transform may be before it is reported as missing."""
 
 
 def echo(
@@ -54,7 +54,7 @@ def echo(
         Print one JSON object a line: target, source, stamp (ns), translation (x y z, m), rotation (x y z w), static,
         and age (s; null if static).
     remote
-        Ask the buffer that a program of the robot in --robots offers to others, instead of hearing all transforms.
+        Ask the buffer that a program of the robot in --robots offers to others, instead of receiving all transforms.
     """
     try:
         for frame in (target, source):
@@ -107,7 +107,7 @@ async def _print_from(
 
 
 def _now_for(stamp: int, clock: Clock) -> int | None:
-    """The time to count the age of a stamp from, in ns; None while the time of a simulation may yet come."""
+    """The time (ns) from which the age of a stamp is counted; None while a simulated time may still arrive."""
     now = clock.now()
     return None if isinstance(clock, ReplayClock) and not clock.is_set and likely_cause(stamp, now) else now
 

@@ -26,7 +26,7 @@ from tfbus.stamps import SECOND
 _SPREADS = tuple(
     Column(f"{what} {value}", right=True) for what in ("period", "delay") for value in ("mean", "p99", "max")
 )
-# The mean is the rate in other words; the least important column has the lowest number.
+# The least important column has the lowest number: the mean period only repeats the rate.
 _IMPORTANCE = (1, 2, 4, 3, 5, 6)
 _TIMES = tuple(column._replace(importance=importance) for column, importance in zip(_SPREADS, _IMPORTANCE, strict=True))
 _INDENT = 10
@@ -50,8 +50,8 @@ def info(
 ) -> None:
     """Print the contents of a recording: its topics, its frames with parents, rates, gaps and delays, and its senders.
 
-    A period is the time between two stamps, a delay the time from a stamp to the log time; of each the mean, what 99 %
-    do not exceed, and the greatest are shown. Columns that do not fit the terminal are left out.
+    A period is the time between two stamps; a delay is the time from a stamp to the log time. The tables show the mean,
+    the 99th percentile and the maximum of each. Columns that do not fit the terminal are left out.
 
     Example: tfbus info run.mcap
 

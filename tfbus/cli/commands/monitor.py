@@ -36,7 +36,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """The way between two frames.
+    """The path between two frames.
 
     Attributes
     ----------
@@ -71,9 +71,9 @@ def monitor(
     """Measure the rate, the delay, the jitter and the losses of each frame and sender of a domain, until Ctrl-C.
 
     A delay is the time from the stamp of a sample to its arrival here; jitter is the standard deviation of the time
-    between two arrivals. Late samples have an older stamp than one before; lost ones are missing between the stamps, as
-    far as a sender has a fixed rate. With TARGET and SOURCE, only the frames between the two are shown, and the
-    slowest of them.
+    between two arrivals. A late sample has an older stamp than an earlier sample. Lost samples are counted by the gaps
+    between stamps, if the sender has a fixed rate. With TARGET and SOURCE, only the frames between the two are shown,
+    and the slowest of them.
 
     Example: tfbus monitor map base_link
 
@@ -84,13 +84,13 @@ def monitor(
     source
         The frame whose transform it is.
     window
-        The time over which is measured, in s before now.
+        How far back the measurements reach, in s.
     rate
         Updates per second.
     once
         Print once and end.
     duration
-        How many seconds to listen before, with --once.
+        With --once, how many seconds to listen first.
     as_json
         Print a JSON object instead, one a line unless --once is given; durations in s.
     """
@@ -132,13 +132,13 @@ def monitor(
 
 
 def chain_of(tree: TransformTree, target: str, source: str, arrivals: Sequence[Arrival], now: int) -> Chain:
-    """The way between two frames, with what was measured of its frames up to `now`, in ns."""
+    """The path between two frames, with the measurements of its frames up to `now`, in ns."""
     try:
         frames = tree.chain(target, source)
         newest = tree.latest_common_stamp(target, source)
     except TransformLookupError as error:
         return Chain([], None, None, str(error))
-    # The frame on top of a way has its edge above the way.
+    # The edge of the top frame is above the path.
     crossed = {child for pair in pairwise(frames) for child in pair if tree.parent(child) in pair}
     moving = [each for each in arrivals if each.frame in crossed and each.rate is not None]
     slowest = min(moving, key=lambda each: each.rate or 0.0).frame if moving else None
@@ -165,10 +165,10 @@ def text_lines(arrivals: Sequence[Arrival], chain: Chain | None, width: int | No
 def _describe(chain: Chain) -> str:
     if not chain.frames:
         return f"no transform: {chain.problem}"
-    way = " <- ".join(chain.frames)
+    path = " <- ".join(chain.frames)
     age = "static" if chain.age is None else f"age {format_span(chain.age)}"
     slowest = f", the slowest is {chain.slowest}" if chain.slowest else ""
-    return f"{way}: {age}{slowest}"
+    return f"{path}: {age}{slowest}"
 
 
 def _row(arrival: Arrival) -> tuple[str, ...]:

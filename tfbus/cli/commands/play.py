@@ -31,7 +31,7 @@ except ImportError:
     termios = None  # type: ignore[assignment]
 
 _DISCOVERY = 1.0
-"""s; other programs are found within, or are not there."""
+"""The time in s in which other programs are found, if there are any."""
 _REDRAW_PERIOD = 0.1
 _RATES: Final = tuple(factor * 10.0**power for power in range(-2, 3) for factor in (1, 2, 5))
 _KEYS = "space pauses, s or the right arrow plays the next message, + and - change the rate"
@@ -71,7 +71,7 @@ def play(
     until
         The end, in the same ways.
     clock
-        Tell the time of the recording as well: echo, tree and listen follow it, so their ages are ages of then.
+        Publish the time of the recording as well; echo, tree and listen follow it, and count ages by it.
     """
     start, end = _log_times(file, topics, since, until)
 
@@ -114,7 +114,7 @@ def _print_summary(player: Player, bus: Bus, seconds: float) -> None:
 class Keyboard:
     """The keys that are pressed, for the body of a ``with``: ``async for key in keyboard.keys()``.
 
-    A key is its letter, or ``"up"``, ``"down"``, ``"left"``, ``"right"``. Ctrl-C and Ctrl-Z do what they always do.
+    A key is its letter, or ``"up"``, ``"down"``, ``"left"``, ``"right"``. Ctrl-C and Ctrl-Z work as usual.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ class Keyboard:
         self.give_back()
 
     def take(self) -> None:
-        """Have the terminal pass each key on at once, and show none; does nothing in the background."""
+        """Make the terminal pass on each key at once, without an echo; does nothing in the background."""
         with suppress(OSError, termios.error):
             # To change the terminal from the background would stop the program.
             if os.tcgetpgrp(self._terminal) != os.getpgrp():
@@ -147,7 +147,7 @@ class Keyboard:
             termios.tcsetattr(self._terminal, termios.TCSADRAIN, flags)
 
     def give_back(self) -> None:
-        """Set the terminal as it was before."""
+        """Restore the settings of the terminal."""
         before, self._before = self._before, None
         if before is not None:
             with suppress(OSError, termios.error):
@@ -222,7 +222,7 @@ async def _steer(keys: Keyboard, player: Player, everything: anyio.CancelScope) 
 
 
 def press(player: Player, key: str) -> None:
-    """Do what a key says; other keys do nothing."""
+    """Act on a key; unknown keys do nothing."""
     if key == " ":
         if player.paused:
             player.resume()
@@ -247,7 +247,7 @@ def _log_times(
     """The log times, in ns, of the first and the last instant to play."""
     with topics.open(file) as recording:
         if not recording.finished:
-            warn(f"{file} is cut, or its writer did not finish it: this is what can be read")
+            warn(f"{file} is cut, or its writer did not finish it: playing its readable part")
         start, end = recording.start, recording.end
         for remark in recording.remarks:
             warn(remark)

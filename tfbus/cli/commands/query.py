@@ -95,7 +95,7 @@ def query(
     parquet
         Write a Parquet file instead.
     max_speed
-        Leave out transforms that no frame can have reached at this speed, in m/s.
+        Leave out transforms that a frame can only have reached at a higher speed than this, in m/s.
     """
     pairs = _pairs(target, source, further)
     given: dict[Format, bool] = {"csv": as_csv, "json": as_json, "tum": tum}
@@ -212,7 +212,7 @@ def write_parquet(rows: Iterator[Row], path: Path) -> None:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise UsageError(f"--parquet needs a package more: {pip_install('parquet')}") from None
+        raise UsageError(f"--parquet needs one more package: {pip_install('parquet')}") from None
     names = pa.dictionary(pa.int32(), pa.string())
     fields = [("target", names), ("source", names), ("stamp", pa.int64())]
     schema = pa.schema(fields + [(name, pa.float64()) for name in _NUMBERS])

@@ -35,9 +35,9 @@ from tfbus.tree.rendering import Branch, branches
 
 AUTHORITY = "robot"
 _ALIKE = 0.7
-"""The least ratio of equal letters in a misspelt name and the one that was meant."""
+"""The least ratio of equal letters in a misspelt name and a suggested one."""
 _LEAST_POSITION = 16
-"""The shortest that a position is made for the frames to have room, in columns."""
+"""The least width, in columns, to which a position is shortened to make room for the frames."""
 _COLUMNS = (Column("frame"), Column("joint", importance=2), Column("type", importance=1), Column("position"))
 
 
@@ -53,16 +53,15 @@ def robot(
 ) -> None:
     """Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at zero.
 
-    Fixed joints are published once, the others again and again. A frame that is refused, because an edge of another
-    program is in its way, is tried again. A position beyond the limits of its joint is reported and
-    published all the same.
+    Fixed joints are published once, the others again and again. If a frame is refused, because it conflicts with an
+    edge of another program, it is tried again. A position beyond the limits of its joint is reported, but published.
 
     Example: tfbus robot arm.urdf shoulder=0.5 elbow=-1.2 --tree
 
     Parameters
     ----------
     file
-        A URDF. Without one, --follow takes that of /robot_description of ROS.
+        A URDF. Without one, --follow takes the URDF from /robot_description of ROS.
     position
         As NAME=NUMBER, the position of a joint in rad or m; for a planar joint x,y,angle, for a floating one
         x,y,z,qx,qy,qz,qw.
@@ -76,7 +75,7 @@ def robot(
         A prefix for the names of all frames, such as robot1/.
     """
     if file is None and not (follow and link.ros):
-        raise UsageError("give a URDF, or take that of ROS with --follow and --ros")
+        raise UsageError("give a URDF, or take the URDF of ROS with --follow and --ros")
     if file is not None and "=" in file.name and not file.exists():
         raise UsageError(f"the URDF comes first: tfbus robot FILE {file}")
     if follow and not link.ros:
@@ -121,14 +120,14 @@ async def _follow(bus: Bus, link: LinkOptions, model: RobotModel | None, prefix:
     say(f"publishing the frames of {model.name!r} as /joint_states of {link.place} says, until Ctrl-C")
     async with AsyncExitStack() as stack:
         for place in link.ros:
-            # A link for the positions only: the frames pass by the others.
+            # This link carries the positions only; other links carry the frames.
             positions_only = ros_link(bus, place, send=False, frames=(), joint_states=publisher.publish)
             await stack.enter_async_context(positions_only)
         await anyio.sleep_forever()
 
 
 async def _model_of_ros(bus: Bus, link: LinkOptions) -> RobotModel:
-    """Wait for the URDF on /robot_description; raises `UsageError` if it is no robot."""
+    """Wait for the URDF on /robot_description; raises `UsageError` if it is not a robot."""
     described = anyio.Event()
     texts: list[str] = []
 
@@ -184,7 +183,7 @@ def tree_lines(
 
 
 def _layout(rows: Sequence[tuple[str, str, str, str, str]], width: int | None) -> tuple[int, int]:
-    """The width of a level, and that of the positions, which are shortened first where the frames would not fit."""
+    """The widths of a level and of the positions; if the frames do not fit, the positions are shortened first."""
     positions = max(cells(row[4]) for row in rows)
     least = min(_LEAST_POSITION, positions)
     for step in (4, 2, 1):

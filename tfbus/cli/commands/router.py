@@ -9,26 +9,25 @@ from tfbus.cli.domain import run
 from tfbus.cli.output import say
 from tfbus.errors import pip_install
 
-_ON_THIS_MACHINE = "tcp/127.0.0.1:17447"
-
 
 def router(
     *,
-    listen: tuple[str, ...] = (_ON_THIS_MACHINE,),
+    listen: tuple[str, ...] = (),
     connect: tuple[str, ...] = (),
     backend: Backend = "asyncio",
 ) -> None:
-    """Pass on what programs of all domains send each other, until Ctrl-C.
+    """Connect the programs of all domains with each other, until Ctrl-C.
 
-    For programs on several machines, or of several users of one. They connect to it with --connect; each program needs
-    one router, and routers that are connected are as one.
+    A router is for programs on several machines, or of several users of one machine. They join with --connect. Each
+    program needs one router; connected routers act as one.
 
     Example: tfbus router --listen tcp/192.168.1.5:7447
 
     Parameters
     ----------
     listen
-        Listen at this address; may be given several times. Only this machine reaches the default.
+        Listen at this address; may be given several times. By default at port 17447 of the loopback, which only this
+        machine reaches.
     connect
         Connect to another router that listens at this address; may be given several times.
     backend
@@ -36,18 +35,21 @@ def router(
     """
     try:
         from tfbus.links.zenoh import ZenohRouter
+        from tfbus.links.zenoh.zenoh_router import ROUTER
     except ImportError:
-        raise UsageError(f"a router needs a package more: {pip_install('cli,zenoh')}") from None
+        raise UsageError(f"a router needs one more package: {pip_install('cli,zenoh')}") from None
+
+    addresses = listen or (ROUTER,)
 
     async def route() -> None:
         try:
-            async with ZenohRouter(listen, connect=connect):
+            async with ZenohRouter(addresses, connect=connect):
                 onward = f", and on to {' and '.join(connect)}" if connect else ""
-                say(f"routing at {' and '.join(listen)}{onward}, until Ctrl-C")
+                say(f"routing at {' and '.join(addresses)}{onward}, until Ctrl-C")
                 await anyio.sleep_forever()
         except OSError as error:
             why = os.strerror(error.errno) if error.errno else error
-            raise UsageError(f"cannot listen at {' or '.join(listen)}: {why}") from None
+            raise UsageError(f"cannot listen at {' or '.join(addresses)}: {why}") from None
         except ValueError as error:
             raise UsageError(str(error)) from None
 

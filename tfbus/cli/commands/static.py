@@ -34,10 +34,10 @@ def static(
     authority: str = "tfbus static",
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:
-    """Publish the static transform of CHILD in PARENT, or all that a file holds, until Ctrl-C.
+    """Publish the static transform of CHILD in PARENT, or all transforms of a file, until Ctrl-C.
 
-    Programs that join later receive it too. If an edge of another program is in its way, it is tried again once a
-    second. After the end, programs that have it keep it, and programs that join then do not get it.
+    Programs that join later receive it too. If it conflicts with an edge of another program, it is tried again once a
+    second. After Ctrl-C, programs that have it keep it; programs that join later do not get it.
 
     Example: tfbus static base_link base_laser --xyz 0.1 0 0.2 --rpy 0 0 1.5708
 
@@ -64,7 +64,7 @@ def static(
     _check_habits((parent, *([] if child is None else [child]), *further))
     if child is None:
         if any(given is not None for given in (rpy, rpy_deg, quaternion)) or any(xyz):
-            raise UsageError("CHILD is missing; without it, the numbers are those of a file, and no option gives them")
+            raise UsageError("CHILD is missing; without it, transforms come from a file, and no option gives numbers")
         samples = _from_file(Path(parent), authority)
     else:
         samples = [_sample(parent, child, _transform(xyz, rpy, rpy_deg, quaternion), authority)]
@@ -83,7 +83,7 @@ def static(
 
 
 def _check_habits(words: Sequence[str]) -> None:
-    """Raise an error that says the right form, if somebody types what tf2's static_transform_publisher takes."""
+    """Raise an error with the right form, if the words are arguments of tf2's static_transform_publisher."""
     if len(words) <= 2:
         return
     count = next((at for at, word in enumerate(words) if not _is_number(word)), len(words))

@@ -52,7 +52,7 @@ def tree(
         How many seconds to listen, from the first transform on; by default until every frame has been heard twice and
         all are connected, at least 1 and at most 5.
     watch
-        Show it live until Ctrl-C; if the output is no terminal, print it again and again.
+        Show it live until Ctrl-C; if the output is not a terminal, print it again and again.
     rate
         Updates per second, with --watch.
     dot
@@ -104,13 +104,13 @@ def tree(
                 await show_once()
                 for remark in remarks(buffer.tree.edges()):
                     say(remark)
-                link.say_who_is_heard(links)
+                link.print_peers(links)
 
     link.run(show_tree, clock=ReplayClock(), links=links)
 
 
 async def _listen_for_a_period(bus: Bus, tree: TransformTree) -> None:
-    """Wait until each moving frame has been heard twice and all frames are connected, or that takes too long."""
+    """Wait until each moving frame has been heard twice and all frames are connected, or until the time is up."""
     await bus.clock.sleep(_LEAST_DURATION)
     with bus.clock.move_on_after(_LONGEST_DURATION - _LEAST_DURATION):
         while remarks(tree.edges()):
@@ -126,7 +126,7 @@ def remarks(edges: Sequence[Edge]) -> list[str]:
     children = {edge.child for edge in edges}
     roots = sorted({edge.parent for edge in edges} - children)
     if len(roots) > 1:
-        lines.append(f"{len(roots):,} trees, below {_names(roots)}: what connects them was not sent meanwhile")
+        lines.append(f"{len(roots):,} trees, below {_names(roots)}: no edge between them was sent meanwhile")
     return lines
 
 

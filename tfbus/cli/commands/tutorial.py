@@ -1,7 +1,7 @@
 """``tfbus broadcast``, ``tfbus listen`` and ``tfbus demo``: the robot of the classic tf tutorial.
 
 A laser is mounted 0.1 m forward of the centre of the base and 0.2 m above it. A broadcaster sends that transform at
-100 Hz; once a second, a listener transforms a point from the frame of the laser to that of the base and prints it. They
+100 Hz; once a second, a listener transforms a point from the frame of the laser to the base and prints it. They
 are two programs of a domain, or for ``demo`` two tasks of one process.
 """
 
@@ -115,8 +115,8 @@ def demo(
 async def send_laser(bus: Bus, rate: float = 100.0) -> None:
     """Send the transform of the laser `rate` times a second, without drift and without end.
 
-    A transform that the bus refuses, because it conflicts with those of other authorities, is logged once; the next one
-    is sent all the same.
+    If the bus refuses a transform, because it conflicts with transforms of other authorities, that is logged once, and
+    the next one is sent all the same.
     """
     broadcaster = TransformBroadcaster(bus, authority="robot_tf_publisher", invalid="drop")
     async for _ in bus.clock.ticks(rate):

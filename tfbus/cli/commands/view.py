@@ -49,13 +49,13 @@ def view(
     trail
         Draw where this frame was in the last ten seconds; may be given several times.
     port
-        Serve the page at this port, or the next one that is free; 0 for any.
+        Serve the page at this port, or at the next free one; 0 for any.
     host
         Listen at this address; 0.0.0.0 lets all other machines see and use the page.
     origin
         Let pages of this other site use it too, such as https://robot.example; may be given several times.
     rate
-        Draw at most so many times per second.
+        Draw at most this many times per second.
     """
     try:
         from tfbus.view import View

@@ -35,11 +35,11 @@ from cyclonedds.util import duration
 from tfbus._aio.loops import wait_for_all
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.carrier import Presence, Received
 from tfbus.links.dds.readers import PATIENCE, RETRY, Greeting, Publishers, ReaderThread, delete, is_of_ros, join, read
 from tfbus.links.dds.types import RawClock, RawEntitiesInfo, RawJointState, RawString, RawTFMessage
 from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, as_domain, settings_of
+from tfbus.links.seams import Presence, Received
 from tfbus.tf_message import MalformedMessageError, encode
 
 Discovery = Literal["localhost", "subnet"]

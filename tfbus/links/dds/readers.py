@@ -312,6 +312,11 @@ class Publishers:
         self._named = 0
         self._bytes = 0
 
+    def __len__(self) -> int:
+        """How many publishers and names of publishers are remembered."""
+        with self._lock:
+            return len(self._publishers) + self._named
+
     def message(self, publisher: str, participant: str, payload: bytes, static: bool) -> None:
         """Take a message of a publisher."""
         with self._lock:

@@ -25,8 +25,10 @@ Who connects to whom
 --------------------
 The younger link connects to the older ones, when it opens and whenever the folder of the domain has changed; so two
 links never connect to each other, and one that was missed is met at the next look. A link looks often at first, and
-then once a second, which costs one question to the system while nothing has changed. An id in use is not taken over:
-another connection of that id is refused while the first one is there. A newer one replaces one that is not met yet.
+then once a second, which costs one question to the system while nothing has changed. A younger link that has not
+connected within a second may have been killed: a connection on which nothing is said finds that out, and then its name
+is removed. An id in use is not taken over: another connection of that id is refused while the first one is there. A
+newer one replaces one that is not met yet.
 
 Present and lost
 ----------------
@@ -57,10 +59,9 @@ import anyio
 import anyio.lowlevel
 
 from tfbus._aio.turn_budget import TurnBudget
-from tfbus.links.local.connection import Connection, Hello, frame_of
+from tfbus.links.local.connection import Connection, Hello, Poll, frame_of
 from tfbus.links.local.meeting_place import MeetingPlace
-from tfbus.links.local.poll import Poll
-from tfbus.links.wire import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
 from tfbus.tf_message import MalformedMessageError
 
 MOST_CONNECTIONS: Final = 1_000
@@ -138,6 +139,9 @@ class LocalWire(Wire):
     def is_heard(self, channel: str) -> bool:
         return bool(self._hearers.get(channel))
 
+    def is_behind(self) -> bool:
+        return any(readable for _, readable, _ in self._poll.ready())
+
     def publish(self, channel: str, message: bytes) -> None:
         hearers = self._hearers.get(channel)
         if hearers and len(message) <= MAX_MESSAGE:
@@ -214,9 +218,9 @@ class LocalWire(Wire):
             self._look()
 
     def _look(self) -> None:
-        """Connect to the older links that are not met, and show this link's name again if it has vanished."""
+        """Connect to the links that are not met and due, and show this link's name again if it has vanished."""
         try:
-            names = self._place.older()
+            names = self._place.others()
         except FileNotFoundError:
             try:
                 self._listen()
@@ -227,9 +231,14 @@ class LocalWire(Wire):
         except OSError as error:
             self._warn_once(error)
             return
+        now, met = monotonic(), {link[:8] for link in self._links}
         for name in names:
-            if name not in self._dialled and self._retries.get(name, (0.0,))[0] <= monotonic():
-                self._dial(name)
+            if name not in self._dialled and name[16:] not in met:
+                if name > self._place.name and name not in self._retries:
+                    # It comes by itself, unless it was killed.
+                    self._retries[name] = (now + _RARELY, _FIRST_RETRY)
+                elif self._retries.get(name, (0.0,))[0] <= now:
+                    self._dial(name)
         if len(self._retries) > len(names):
             self._retries = {name: self._retries[name] for name in names if name in self._retries}
 
@@ -249,8 +258,9 @@ class LocalWire(Wire):
             return
         connection = self._dialled[name] = Connection(sock, self._poll, key, name, connected)
         self._connections.add(connection)
-        connection.hello = Hello.write(self._domain, self.id, self._robot)
-        connection.send(frame_of(connection.hello.content))
+        if name < self._place.name:
+            connection.hello = Hello.write(self._domain, self.id, self._robot)
+            connection.send(frame_of(connection.hello.content))
 
     async def _accept(self, budget: TurnBudget) -> None:
         while self._listener is not None:
@@ -362,6 +372,7 @@ class LocalWire(Wire):
             self._dialled.pop(connection.dialled, None)
             if connection.met and monotonic() - connection.begun > _STEADY:
                 self._retries.pop(connection.dialled, None)
+        if connection.dialled or connection.met:
             self._stirred.set()
         if connection.met:
             del self._links[connection.link]

@@ -3,7 +3,7 @@
 The folder of a domain has one file for each of its links: a Unix socket, or, with `loopback`, a text with the port of
 the loopback at which the link listens and a key. Its name is the time of the link's opening and a part of its id, so
 that any two links agree about which is the younger. A name becomes visible once the link listens, by a rename. So a
-file at which nobody listens belongs to a process that was killed, and the first that finds it may remove it.
+file at which nobody listens belongs to a process that was killed, and the first that finds it removes it.
 
 The directory is the one that was given, or named by ``TFBUS_RUNTIME_DIR``, or else ``tfbus`` in ``XDG_RUNTIME_DIR``, or
 else ``tfbus-UID`` in the directory for temporary files. It belongs to the user and is closed to all others, which is
@@ -104,7 +104,7 @@ class MeetingPlace:
         self.name = ""
         self.key = secrets.token_bytes(32) if loopback else b""
         self._changed = 0
-        self._older: list[str] = []
+        self._others: list[str] = []
 
     def open(self) -> socket.socket:
         """Listen, and show the link's name; also again, when the name has vanished.
@@ -155,8 +155,8 @@ class MeetingPlace:
         self._changed = 0
         return listener
 
-    def older(self) -> list[str]:
-        """The names of the links that are older than this one; a single question to the system if none has changed.
+    def others(self) -> list[str]:
+        """The names of the other links; a single question to the system if none has changed.
 
         Raises
         ------
@@ -169,12 +169,12 @@ class MeetingPlace:
             names = [path.name for path in self._folder.iterdir()]
             if self.name not in names:
                 raise FileNotFoundError(errno.ENOENT, "the link's name has vanished", str(self._folder / self.name))
-            self._older = [name for name in names if name < self.name and _NAME.fullmatch(name) and name[0] != "."]
+            self._others = [name for name in names if name != self.name and _NAME.fullmatch(name) and name[0] != "."]
             for name in names:
                 if name[0] == "." and (found := _NAME.fullmatch(name)) and int(found[1], 16) < now - FORGOTTEN:
                     self.remove(name)
             self._changed = changed if now - changed > SETTLED else 0
-        return self._older
+        return self._others
 
     def dial(self, name: str) -> tuple[socket.socket, bytes, bool]:
         """Connect to a link without waiting.

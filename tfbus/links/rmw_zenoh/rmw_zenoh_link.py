@@ -27,11 +27,16 @@ import zenoh.ext
 
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.carrier import Received
 from tfbus.links.ros.ros_link import RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, as_domain, settings_of
-from tfbus.links.zenoh._closing import begin_to_close, close_session, use_zenoh, wait_until_closed
-from tfbus.links.zenoh.addresses import without_source_location
+from tfbus.links.seams import Received
+from tfbus.links.zenoh.sessions import (
+    begin_to_close,
+    close_session,
+    use_zenoh,
+    wait_until_closed,
+    without_source_location,
+)
 from tfbus.tf_message import MalformedMessageError, encode
 
 TYPE: Final = "tf2_msgs::msg::dds_::TFMessage_"

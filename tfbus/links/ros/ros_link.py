@@ -15,13 +15,12 @@ from typing import Any, Unpack
 from tfbus.bus.bus import Bus
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.carrier import Received, ReceivedMessage, SendReport
 from tfbus.links.endpoint import ForeignEnd
 from tfbus.links.link import Link
-from tfbus.links.outbox import OutgoingBatch, Turn
-from tfbus.links.relay import ReceivedBatch, ReceivedTransform
+from tfbus.links.relay import OutgoingBatch, ReceivedBatch, ReceivedTransform, Turn
 from tfbus.links.ros.messages import decode_clock, decode_text
 from tfbus.links.ros.settings import RosOptions, RosSettings
+from tfbus.links.seams import Received, ReceivedMessage, SendReport
 from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, MalformedMessageError, decode, decode_in_parts, refusal
 
@@ -70,7 +69,7 @@ class RosMessage:
 
 
 class RosCarrier:
-    """A carrier to ROS, see `tfbus.links.carrier.Carrier`; a subclass connects, publishes and closes.
+    """A carrier to ROS, see `tfbus.links.seams.Carrier`; a subclass connects, publishes and closes.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from tfbus.clock import SimulatedClock
 from tfbus.errors import InvalidTransformError
 from tfbus.frames import Prefix, as_prefix
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.clock_follower import HearsTime
+from tfbus.links.endpoint import HearsTime
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 

@@ -35,7 +35,6 @@ import anyio
 from tfbus._aio.task_groups import close_task_group
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.carrier import Presence, Received, SendReport
 from tfbus.links.relay import ReceivedTransform
 from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, settings_of
@@ -58,6 +57,7 @@ from tfbus.links.rosbridge.protocol import (
     unsubscribe,
 )
 from tfbus.links.rosbridge.websocket import WebSocket, check_url
+from tfbus.links.seams import Presence, Received, SendReport
 from tfbus.tf_message import Decoded, MalformedMessageError
 
 CONFIRM_TIME, LONGEST_CONFIRM_TIME = 2.0, 30.0

@@ -44,12 +44,14 @@ import anyio
 import zenoh
 
 from tfbus._aio.loops import LoopWaker
-from tfbus.links.wire import MAX_MESSAGE, Hearing, Joined, Left, Receive
-from tfbus.links.zenoh._closing import Keeper, begin_to_close, close_session
-from tfbus.links.zenoh.addresses import (
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
+from tfbus.links.zenoh.sessions import (
     LONGEST_NAME,
     Addresses,
+    Keeper,
+    begin_to_close,
     client_config,
+    close_session,
     endpoints,
     open_client,
     open_session,
@@ -75,8 +77,8 @@ _TOKEN = re.compile(
 _DROP, _REMOTE = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE
 
 
-class ZenohWire:
-    """A `tfbus.links.wire.Wire` over zenoh's routers.
+class ZenohWire(Wire):
+    """A `tfbus.links.seams.Wire` over zenoh's routers.
 
     Parameters
     ----------
@@ -92,7 +94,7 @@ class ZenohWire:
     config : mapping of str to any, optional
         Settings of zenoh by their path: TLS, access control.
     lease : float, optional
-        Seconds of silence after which the other end takes this one for lost; by default `addresses.LEASE`.
+        Seconds of silence after which the other end takes this one for lost; by default `sessions.LEASE`.
 
     Raises
     ------
@@ -133,7 +135,7 @@ class ZenohWire:
         self._failure: OSError | None = None
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
-        """See `tfbus.links.wire.Wire`. It waits a second for a router, and warns later if there is none.
+        """See `tfbus.links.seams.Wire`. It waits a second for a router, and warns later if there is none.
 
         Raises
         ------
@@ -156,27 +158,27 @@ class ZenohWire:
             raise self._failure
 
     async def run(self) -> None:
-        """See `tfbus.links.wire.Wire`. A thread of the wire does what takes time, because zenoh's calls block."""
+        """See `tfbus.links.seams.Wire`. A thread of the wire does what takes time, because zenoh's calls block."""
         await anyio.sleep_forever()
 
     def is_heard(self, channel: str) -> bool:
-        """See `tfbus.links.wire.Wire`. It is true for a new channel, until the router has said who hears it."""
+        """See `tfbus.links.seams.Wire`. It is true for a new channel, until the router has said who hears it."""
         session = self._session
         return session is not None and session.is_heard(channel)
 
     def publish(self, channel: str, message: bytes) -> None:
-        """See `tfbus.links.wire.Wire`."""
+        """See `tfbus.links.seams.Wire`."""
         session = self._session
         if session is not None:
             session.publish(channel, message)
 
     def send(self, link: str, message: bytes) -> bool:
-        """See `tfbus.links.wire.Wire`. It is false while no router is connected, and goes in the order of all."""
+        """See `tfbus.links.seams.Wire`. It is false while no router is connected, and goes in the order of all."""
         session = self._session
         return session is not None and session.send(f"{self._domain}/@to/{link}", message)
 
     async def close(self) -> None:
-        """See `tfbus.links.wire.Wire`. It warns if zenoh goes on closing in the background."""
+        """See `tfbus.links.seams.Wire`. It warns if zenoh goes on closing in the background."""
         late = await self._keeper.end()
         if late is not None:
             self._warn(late)

@@ -5,7 +5,7 @@ from typing import Any, Unpack
 
 from tfbus.bus.bus import Bus
 from tfbus.links.link import DomainLink, DomainOptions, check_domain
-from tfbus.links.zenoh.addresses import Addresses
+from tfbus.links.zenoh.sessions import Addresses
 from tfbus.links.zenoh.wire import ZenohWire
 
 

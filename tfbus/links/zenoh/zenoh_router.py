@@ -8,8 +8,8 @@ from typing import Any, Final, Self
 import anyio
 import anyio.to_thread
 
-from tfbus.links.zenoh._closing import Keeper, close_session
-from tfbus.links.zenoh.addresses import Addresses, open_session, router_config
+from tfbus.links.zenoh.sessions import Addresses, Keeper, close_session, open_session, router_config
+from tfbus.registration import warn_unless_entered
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
 """The address of a router that is given none: only processes of this machine reach it."""
@@ -56,11 +56,13 @@ class ZenohRouter:
         self._entered = False
         self._opened = threading.Event()
         self._failure: OSError | None = None
+        self._never_entered = warn_unless_entered(self)
 
     async def __aenter__(self) -> Self:
         if self._entered:
             raise RuntimeError("a router is entered once: make another one")
         self._entered = True
+        self._never_entered.detach()
         self._keeper.start()
         try:
             await anyio.to_thread.run_sync(self._opened.wait, abandon_on_cancel=True)

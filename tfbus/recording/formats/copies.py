@@ -1,8 +1,8 @@
 """Writing messages of any topic to a new file: MCAP, a bag of ROS 1, or SQLite of ROS 2.
 
-A payload is written as it is where the format can hold its encoding. Else it is converted between CDR and ROS 1, by
-`rosbags` and the definition of its type (`MessageTypes`). Transforms keep every bit in each format: their numbers stay
-bytes, in Foxglove's ``FrameTransforms`` too, whose wire format is that of Protocol Buffers' "Encoding" page.
+A payload is written unchanged if the format can hold its encoding. Otherwise `rosbags` converts it between CDR and
+ROS 1 by the definition of its type (`MessageTypes`). Transforms keep every bit in each format, because their numbers
+stay bytes, also in Foxglove's ``FrameTransforms`` (wire format: the "Encoding" page of Protocol Buffers).
 """
 
 import json
@@ -30,7 +30,7 @@ def write_protobuf(transforms: Sequence[RawTransform]) -> bytes:
     Raises
     ------
     MalformedMessageError
-        If a name is no UTF-8, or a stamp does not fit.
+        If a name is not UTF-8, or a stamp does not fit.
     """
     return b"".join(_field(1, _transform(each)) for each in transforms)
 
@@ -43,7 +43,7 @@ def transforms_schema() -> bytes:
 
 
 def foxglove_channel(source: Channel, metadata: dict[str, str]) -> Channel:
-    """The channel for transforms of another channel, in Foxglove's schema."""
+    """A channel in Foxglove's schema, for the transforms of another channel."""
     return Channel(source.topic, FRAME_TRANSFORMS, "protobuf", "protobuf", transforms_schema(), metadata)
 
 
@@ -107,7 +107,7 @@ class MessageTypes:
         """The name of a type in ROS 2; raises `ValueError` if it has no package."""
         package, _, last = kind.rpartition("/")
         if not package:
-            raise ValueError(f"{kind!r} is no name of a type of ROS")
+            raise ValueError(f"{kind!r} is not the name of a type of ROS")
         return f"{package.removesuffix('/msg')}/msg/{last}"
 
     def convert(self, channel: Channel, payload: bytes) -> bytes:
@@ -116,7 +116,7 @@ class MessageTypes:
         Raises
         ------
         ValueError
-            If the type is not known, or the payload is none of that type.
+            If the type is not known, or the payload is not of that type.
         """
         self._register(channel)
         kind = self.name(channel.type)
@@ -136,7 +136,7 @@ class MessageTypes:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         store: Any = get_typestore(Stores.EMPTY)
-        # The payloads that `convert` gives have the number too.
+        # The payloads of `convert` have the sequence number too.
         store.fielddefs.update(self._store.fielddefs, **get_types_from_msg(_HEADER_OF_ROS1, _HEADER))
         try:
             definition, digest = store.generate_msgdef(self.name(channel.type), ros_version=1)
@@ -145,7 +145,7 @@ class MessageTypes:
         return definition, digest
 
     def _register(self, channel: Channel) -> None:
-        """Add the types that the definition of a channel has and the store does not."""
+        """Add the types that the store lacks and the definition of a channel has."""
         if channel in self._known:
             return
         self._known.add(channel)
@@ -190,7 +190,7 @@ class CannotWriteError(ValueError):
 
 
 class Copy(Protocol):
-    """A new file, made of its path and of the name that it gets when it is finished.
+    """A new file. It is made with its path, and with the name that it gets when it is finished.
 
     Attributes
     ----------
@@ -201,7 +201,7 @@ class Copy(Protocol):
     encoding: str
 
     def holds(self, channel: Channel) -> bool:
-        """Whether payloads with transforms of a channel are written as they are."""
+        """Whether payloads with transforms of a channel are written unchanged."""
         ...
 
     def write(self, channel: Channel, received: int, payload: bytes) -> None:
@@ -218,7 +218,7 @@ class Copy(Protocol):
 
 
 def transform_channel(source: Channel, encoding: str, metadata: dict[str, str]) -> Channel:
-    """The channel for transforms of another channel, in the encoding of a copy."""
+    """A channel in the encoding of a copy, for the transforms of another channel."""
     if encoding == "protobuf":
         return foxglove_channel(source, metadata)
     if encoding == "cdr":
@@ -294,7 +294,7 @@ class FoxgloveCopy(McapCopy):
     encoding = "protobuf"
 
     def __init__(self, path: Path, name: str) -> None:
-        # Without the extra, before there is a file.
+        # Raises without the extra, before the file exists.
         transforms_schema()
         super().__init__(path, name)
 

@@ -1,9 +1,8 @@
 """SQLite files of ROS 2, and folders of ROS 2: one recording in several files, which may be compressed.
 
-A writer that is killed leaves a journal beside its SQLite file, and SQLite needs it to make the file whole. SQLite
-would write into both, so it gets a copy. Where the writer may still be running, the file is read in its place, under
-SQLite's locks. Columns of SQLite hold values of any type, whatever their declaration: a timestamp that is no integer is
-counted.
+A writer that is killed leaves a journal beside its SQLite file, and SQLite needs it to recover the file. The recovery
+writes into both, so SQLite gets a copy. If the writer may still be running, the original is read, under SQLite's locks.
+A column of SQLite holds values of any type, whatever its declaration: timestamps that are not integers are counted.
 
 `FolderStorage` opens the files that ``metadata.yaml`` names, SQLite or MCAP, and merges their messages.
 """
@@ -49,7 +48,7 @@ _DAMAGE = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 _BLOCK: Final = 256
 _BLOCK_BYTES: Final = 16 * MIB
 _STEPS: Final = 100_000
-"""Steps of SQLite's virtual machine between two looks at their number."""
+"""Steps of SQLite's virtual machine between two checks of their number."""
 _STEPS_PER_BYTE: Final = 16
 _MIN_STEPS: Final = 10_000_000
 _IS_STAMP: Final = "typeof(timestamp) = 'integer'"
@@ -70,7 +69,7 @@ class SqliteStorage:
     Raises
     ------
     RecordingError
-        If the file is damaged, or no recording.
+        If the file is damaged, or is not a recording.
     """
 
     complete: Final = True
@@ -86,7 +85,7 @@ class SqliteStorage:
                 # Without "immutable", SQLite would create an empty log beside the recording.
                 self._open(path, "immutable=1")
             elif _beside(path, "-wal") in journals and not _beside(path, "-shm").exists():
-                # Nobody else has it open, and SQLite would create that file.
+                # Nobody else has it open, and SQLite would create the file "-shm".
                 self._recover(path, journals)
             else:
                 try:
@@ -99,7 +98,7 @@ class SqliteStorage:
             ) from error
 
     def _open(self, path: Path, mode: str) -> None:
-        """Open a file and read what it holds."""
+        """Open a file and read its topics."""
         self._file = sqlite3.connect(f"file:{quote(str(path))}?{mode}", uri=True, check_same_thread=False)
         try:
             self._most_steps = _MIN_STEPS + _STEPS_PER_BYTE * path.stat().st_size
@@ -131,7 +130,7 @@ class SqliteStorage:
                 suffix = journal.name.removeprefix(path.name)
                 shutil.copyfile(journal, _beside(copy, suffix))
                 if suffix == "-journal":
-                    # At its very end it could name another file, which SQLite would remove.
+                    # The end of a journal could name another file, which SQLite would remove: overwrite it.
                     with _beside(copy, suffix).open("ab") as file:
                         file.write(bytes(16))
             with closing(sqlite3.connect(copy)) as database:
@@ -150,7 +149,7 @@ class SqliteStorage:
         self._numbered: dict[int, Channel] = {}
         for number, name, kind, encoding, profiles in _bounded(topics):
             if not all(isinstance(text, str) for text in (name, kind, encoding)):
-                # Its messages are counted as those of a topic that is not described.
+                # Its messages are counted as messages of a topic that is not described.
                 continue
             schema_encoding, schema = definitions.get(kind, ("", b""))
             metadata = {"offered_qos_profiles": str(profiles)} if profiles else {}
@@ -191,7 +190,7 @@ class SqliteStorage:
             if lost:
                 yield lost_message(now, f"{lost:,} messages are on topics that the file does not describe")
             if self._untimed:
-                yield lost_message(now, f"{self._untimed:,} messages have a timestamp that is no integer")
+                yield lost_message(now, f"{self._untimed:,} messages have a timestamp that is not an integer")
             promised = {channel: count or 0 for channel, count in self.channels.items() if wanted(channel)}
             yield from shortfalls(now, promised, read)
         if not self.finished and (until is None or until >= (self.end or 0)):
@@ -261,8 +260,8 @@ METADATA: Final = "metadata.yaml"
 class FolderStorage:
     """A `Storage` of the recording in one folder: the files that ``metadata.yaml`` names.
 
-    Without it, because the writer was killed, these are all files with the endings of recordings; of a compressed file
-    and an uncompressed one of the same name, the uncompressed one.
+    If it is missing, because the writer was killed, all files with the endings of recordings are read. If a file is
+    there compressed and uncompressed, the uncompressed one is read.
 
     Parameters
     ----------
@@ -332,7 +331,7 @@ class FolderStorage:
                 raise ValueError("it names no file")
         except FileNotFoundError:
             return None
-        # A parser of YAML raises many kinds of errors; deep nesting is one of recursion.
+        # A parser of YAML raises many kinds of errors; deep nesting is a `RecursionError`.
         except Exception as error:  # noqa: BLE001
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             self.remarks.append(f"{METADATA} is ignored, as it cannot be read: {reason}")
@@ -356,7 +355,7 @@ class FolderStorage:
 
     @property
     def channels(self) -> Mapping[Channel, int | None]:
-        """The channels of all files; while some file has not told all of its own, no count is known."""
+        """The channels of all files; no count is known until every file knows all of its channels."""
         complete = self.complete
         return {
             channel: count if complete else None for file in self._files for channel, count in file.channels.items()
@@ -382,7 +381,7 @@ class FolderStorage:
             yield from self._shortfalls(now, wanted, read)
 
     def packed(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[Stored]:
-        """The messages of `messages`, many at once; those of a single file are packed if that file packs them."""
+        """The messages of `messages`, many at once; packed if a single file has them and packs them."""
         if len(self._files) > 1 or self._refused:
             yield from batches(self.messages(wanted, since, until))
             return
@@ -400,7 +399,7 @@ class FolderStorage:
             yield from batches(self._shortfalls(now, wanted, read))
 
     def _shortfalls(self, now: int, wanted: Wanted, read: Counter[Channel]) -> Iterator[StoredMessage]:
-        """Report each topic with messages that the metadata promise, and that the files neither promise nor have."""
+        """Report each topic whose messages the metadata promise, but the files neither promise nor have."""
         assert self._promised is not None
         known: dict[str, list[Channel]] = {}
         for channel in self.channels:
@@ -415,7 +414,7 @@ class FolderStorage:
 
 
 def _text(value: object) -> str:
-    """A name in the metadata; a text of anything else, such as of lists that are in each other, could be endless."""
+    """A name in the metadata; `ValueError` for other types, because the text of a recursive list could be endless."""
     if not isinstance(value, str):
         raise TypeError(f"a name is a {type(value).__name__}")
     return value
@@ -431,13 +430,13 @@ def _open(path: Path, open_file: Callable[[Path], Storage]) -> Storage:
     if path.suffix != COMPRESSED:
         return open_file(path)
     with _unpacked(path) as file:
-        # The reader keeps the file open, and nothing of it stays if the program is killed.
+        # The reader keeps the open file, whose name is removed: nothing stays if the program is killed.
         return open_file(file)
 
 
 @contextmanager
 def _unpacked(path: Path) -> Iterator[Path]:
-    """A path of the unpacked file for as long as it takes to open it.
+    """A path of the unpacked file, until the end of the ``with``; an open file stays readable.
 
     Raises
     ------
@@ -458,7 +457,7 @@ def _unpacked(path: Path) -> Iterator[Path]:
 
 
 def _nameless_file() -> BinaryIO:
-    """A temporary file that can get a name, where the system has such files; else one that has a name already."""
+    """A temporary file without a name; where the system has no such files, one with a name."""
     with suppress(OSError, AttributeError):
         return os.fdopen(os.open(gettempdir(), os.O_TMPFILE | os.O_RDWR, 0o600), "w+b")
     return cast(BinaryIO, NamedTemporaryFile(prefix="tfbus-"))

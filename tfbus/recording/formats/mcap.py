@@ -82,7 +82,7 @@ class ChunkPacker:
     Parameters
     ----------
     reading : McapReading
-        Knows the wanted channels, and counts what is in the chunks.
+        Knows the wanted channels, and counts the messages in the chunks.
     """
 
     def __init__(self, reading: "McapReading") -> None:
@@ -111,7 +111,7 @@ class ChunkPacker:
         present, which, counts = np.unique(numbers, return_inverse=True, return_counts=True)
         self._reading.count(dict(zip(present.tolist(), counts.tolist(), strict=True)))
         wanted = [self._place(self._reading.wanted_channel(number)) for number in present.tolist()]
-        # A log time that is no stamp becomes negative.
+        # A log time that is not a stamp becomes negative.
         whole = Packed(data, self._table, np.array(wanted, np.int64)[which], received.view(np.int64), starts, ends)
         yield from in_order(whole if min(wanted, default=0) >= 0 else whole.chosen(whole.numbers >= 0), low, high)
 
@@ -122,7 +122,7 @@ class ChunkPacker:
             return lost_chunk(chunk.place, low, error)
 
     def _place(self, channel: Channel | None) -> int:
-        """The place of a channel in the table of packed messages; -1 for one that is not read."""
+        """The place of a channel in the table of packed messages; -1 for a channel that is not read."""
         if channel is None:
             return -1
         if channel not in self._places:
@@ -147,7 +147,7 @@ _KINDS: Final[dict[int, str]] = {
 """The names of the records that are read."""
 _FIRST_BLOCK: Final = 2**16
 _BLOCK: Final = 2**21
-"""Bytes that are decoded at once: few at first, for the first message of each frame has to be judged by itself."""
+"""Bytes that are decoded at once: few at first, because the first message of each frame has to be judged by itself."""
 
 
 class IndexedChunk(NamedTuple):
@@ -156,7 +156,7 @@ class IndexedChunk(NamedTuple):
     place: ChunkPlace
     length: int
     size: int
-    """Of its content, in bytes."""
+    """The size of its content, in bytes."""
     channels: tuple[int, ...]
 
 
@@ -321,7 +321,7 @@ _FOOTER_LENGTH: Final = 20
 _ANY: Final = Channel("", "", "")
 _PIECE: Final = 2**16
 _MOST_OVERLAPPING: Final = 16
-"""Chunks; if more have to be in memory at once, their messages are merged one by one."""
+"""The greatest number of chunks in memory at once; if more overlap, their messages are merged one by one."""
 
 
 class McapStorage:
@@ -331,7 +331,7 @@ class McapStorage:
     ----------
     path : Path
     file : file, optional
-        The open file to read; by default that of the path.
+        The open file to read; by default, the file at the path is opened.
 
     Attributes
     ----------
@@ -386,7 +386,7 @@ class McapStorage:
 
     @property
     def channels(self) -> Mapping[Channel, int | None]:
-        """All channels known so far; their counts are those of the statistics, or of a whole reading."""
+        """All channels known so far, with counts from the statistics, or from a whole reading."""
         counts = self._counted if self._statistics is None else self._statistics.channel_message_counts
         return {
             channel: None if counts is None else counts.get(number, 0) for number, channel in self._numbered.items()
@@ -457,14 +457,14 @@ class McapStorage:
             with suppress(*DAMAGE, EndOfFile):
                 self._use_index(start)
         if self._statistics is None:
-            # Descriptions of a damaged index would contradict those in the chunks.
+            # Descriptions of a damaged index would contradict the descriptions in the chunks.
             self._schemas.clear()
             self._numbered.clear()
             self._budget = DescriptionBudget()
         return True
 
     def _checksum(self, start: int, end: int) -> int:
-        # In pieces: a large one in memory would, once it is freed, keep `malloc` from giving large ones back.
+        # In pieces: after a large block is freed, `malloc` no longer returns large blocks to the system.
         self._file.seek(start)
         checksum = 0
         while start < end and (piece := self._file.read(min(_PIECE, end - start))):
@@ -507,7 +507,7 @@ class McapStorage:
             self._chunks = sorted(chunks)
 
     def register(self, record: records.McapRecord) -> bool:
-        """Note a schema or a channel; returns whether it agrees with what is known already."""
+        """Note a schema or a channel; returns whether it agrees with the known ones."""
         if isinstance(record, records.Schema):
             if record.id not in self._schemas:
                 self._budget.take(record.name, record.data)
@@ -586,7 +586,7 @@ class McapStorage:
         return self._chunks
 
     def records_from(self, at: int) -> Iterator[tuple[int, int, bytes | None]]:
-        """The records from an offset on, as `read_records`; other readers of the file may come between."""
+        """The records from an offset on, as `read_records`; other readers may move the file's position meanwhile."""
         while True:
             self._file.seek(at)
             try:

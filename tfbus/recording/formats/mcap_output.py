@@ -146,7 +146,7 @@ class McapOutput:
         try:
             from mcap.writer import Writer
         except ImportError:
-            raise ImportError(f"to record needs a package more: {pip_install('bag')}") from None
+            raise ImportError(f"recording needs one more package: {pip_install('bag')}") from None
         self.samples = 0
         self.messages = 0
         self.buffered = 0
@@ -158,7 +158,7 @@ class McapOutput:
             # Not all functions of the writer have types.
             self._writer = writer = cast(Any, Writer(cast(Any, self._file), CHUNK_SIZE))
             writer.start(profile="ros2", library="tfbus")
-            # As ROS 2 Humble has it: newer ones then read the profiles as numbers too, and older ones know no other.
+            # As in ROS 2 Humble: newer versions also read profiles as numbers, and older ones read nothing else.
             writer.add_metadata("rosbag2", {})
         except BaseException:
             self._file.close()
@@ -240,7 +240,7 @@ class McapOutput:
         self._count_written()
 
     def _check_file(self) -> None:
-        """Raise `OSError` if the file does not have all that was written, and count that as not written."""
+        """Raise `OSError` if the file lacks data that were written, and count their samples as not written."""
         try:
             self._file.check()
         except OSError:
@@ -271,7 +271,7 @@ def _by_kind(batch: Batch) -> Iterable[Sequence[TransformStamped]]:
 
 
 class _UnbufferedFile:
-    """A file for the writer, each write of which is complete and goes to the operating system at once."""
+    """A file for the writer. Each write is complete, and goes to the operating system at once."""
 
     def __init__(self, path: str, overwrite: bool) -> None:
         # The working directory may change.

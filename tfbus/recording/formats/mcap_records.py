@@ -1,8 +1,8 @@
 """The records of an MCAP file, and the messages in its chunks (MCAP's specification, sections "Records" and "Chunk").
 
-The package `mcap` parses the rare records. This module only splits a file into records and a chunk into messages: to
-build an object for each message would take ten times as long. `split_chunk` goes from record to record and tells what
-is wrong; `record_places` and `scan_chunks` find the same messages in many whole chunks at once, with numpy.
+The package `mcap` parses the rare records. This module only splits a file into records and a chunk into messages,
+because an object for each message would take ten times as long. `split_chunk` goes from record to record and reports
+damage; `record_places` and `scan_chunks` find the same messages in many whole chunks at once, with numpy.
 """
 
 import struct
@@ -118,7 +118,7 @@ class Chunk(NamedTuple):
 
     @classmethod
     def parse(cls, data: bytes, torn: bool = False) -> "Chunk":
-        """Parse the content of a chunk record; with `torn`, one that may end too early.
+        """Parse the content of a chunk record; with `torn`, the record may end too early.
 
         Raises
         ------
@@ -213,7 +213,8 @@ def split_chunk(
     ----------
     data : bytes
     wanted : callable
-        Gives a channel by its number, None if its messages are not returned; asked again after each other record.
+        Gives a channel by its number, None if its messages are not returned. Called again after each record that is
+        not a message.
     register : callable
         Gets each schema and channel before the messages that follow it.
     torn : bool
@@ -232,7 +233,7 @@ def split_chunk(
     counts: dict[int, int] = {}
     channels: dict[int, Channel | None] = {}
     at = 0
-    # A message has at least so many bytes; what follows the last one is read with care below.
+    # A message has at least this many bytes; the records behind `last` are checked below.
     last = length - _MESSAGE_RECORD.size
     unpack = _MESSAGE_RECORD.unpack_from
     while at < length:
@@ -270,9 +271,9 @@ def split_chunk(
 
 
 _FIRST_STEPS: Final = 16
-"""So many records are read one by one, to find what repeats; more, if a guess was of little use."""
+"""The number of records that are read one by one to find their period; more, if a guess was of little use."""
 _GUESSED: Final = 2**16
-"""So many places are guessed at once, roughly."""
+"""The number of places that are guessed at once, roughly."""
 
 
 def record_places(data: bytes) -> npt.NDArray[np.int64]:
@@ -335,7 +336,7 @@ class ChunkMessages(NamedTuple):
     """The messages of some chunks, in columns."""
 
     numbers: npt.NDArray[np.uint16]
-    """Of the channels."""
+    """The numbers of the channels."""
     received: npt.NDArray[np.uint64]
     """The log times, in ns."""
     starts: npt.NDArray[np.int64]

@@ -1,11 +1,11 @@
 """Reading bags of ROS 1, finished or not (the format "ROSBAG V2.0").
 
-A record of a bag is a header, which is a list of named fields, and data; each of the two has its length before it. The
-first half of this module parses records, and the messages in chunks; `Ros1Storage` is the second half.
+A record of a bag consists of a header (a list of named fields) and data, each with its length before it. The first half
+of this module parses records, and the messages in chunks; `Ros1Storage` is the second half.
 
-The index at the end of a bag lists its chunks. Without it, because the writer was killed or the file was cut, the
-chunks are found one after the other; behind damage, by the bytes that begin each of them. A chunk that is damaged is
-read up to the damage, and reading continues with the next.
+The index at the end of a bag lists its chunks. If it is missing, because the writer was killed or the file was cut, the
+chunks are found one after the other; after damage, by the bytes that begin a chunk. A damaged chunk is read up to the
+damage, and reading continues with the next chunk.
 """
 
 import re
@@ -118,7 +118,7 @@ def parse_fields(header: bytes) -> Fields:
         name, equals, value = header[at + 4 : at + 4 + length].partition(b"=")
         at += 4 + length
         if not equals or at > len(header):
-            raise ValueError("a field of a header is no name with a value")
+            raise ValueError("a field of a header is not a name with a value")
         fields[name] = value
     return fields
 
@@ -197,7 +197,7 @@ class Content(NamedTuple):
     connections: list[tuple[Fields, bytes]]
     """Header and data of each connection."""
     damage: str
-    """The reason why the rest is missing; empty if nothing is."""
+    """The reason why the rest is missing; empty if nothing is missing."""
 
 
 def read_chunk(file: IO[bytes], record: Record, torn: bool = False, budget: UnfoldBudget | None = None) -> bytes:
@@ -212,7 +212,7 @@ def read_chunk(file: IO[bytes], record: Record, torn: bool = False, budget: Unfo
     if size > MAX_CHUNK:
         raise ValueError(f"it claims {size:,} bytes, and {MAX_CHUNK:,} is the bound")
     data = record.read(file, MAX_CHUNK)
-    # While a chunk is written, its header claims nothing.
+    # The header of an unfinished chunk claims no size.
     content = unfold(data, text_in(record.fields, b"compression"), size or MAX_CHUNK, torn, budget)
     if not torn and len(content) != size:
         raise ValueError(f"it claims {size:,} bytes, and holds {len(content):,}")
@@ -361,7 +361,7 @@ class Ros1Storage:
 
     @property
     def channels(self) -> Mapping[Channel, int | None]:
-        """All channels known so far; their counts are those of the index, or of a whole reading."""
+        """All channels known so far, with counts from the index, or from a whole reading."""
         counts = self._counted if self._promised is None else self._promised
         return {channel: None if counts is None else counts[number] for number, channel in self._numbered.items()}
 
@@ -504,7 +504,7 @@ class Ros1Storage:
         raise RecordingError("the file ends before its first message", path=str(self._path), reason="truncated")
 
     def _add_chunk(self, record: Record, budget: UnfoldBudget) -> int:
-        """Note a chunk, with the times and counts of the index records behind it; returns the offset of what follows.
+        """Note a chunk, with the times and counts of the index records behind it; returns the offset behind them.
 
         Raises
         ------
@@ -562,7 +562,7 @@ class Ros1Storage:
         return content
 
     def _register(self, fields: Fields, data: bytes) -> None:
-        """Note a connection, by its record; the first record of a number holds."""
+        """Note a connection, by its record; if several records have its number, the first one counts."""
         number = number_in(fields, b"conn")
         header = parse_fields(data)
         channel = Channel(

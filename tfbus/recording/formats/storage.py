@@ -1,10 +1,10 @@
 """The parts that all formats share: the bounds of a hostile file, channels and messages, and their order by log time.
 
 A `Storage` is an open file. It gives `StoredMessage`, one by one, or `Packed`: many messages in one piece of memory,
-which numpy decodes without a Python object for each. Nothing here knows a format, or what a message holds.
+which numpy decodes without a Python object for each. Nothing here knows a format, or the content of a message.
 
 * Bounds. A few bytes can claim, or unfold to, more than any machine holds. A size beyond its bound is not read, and its
-  place is reported. `tfbus.recording.open_recording` tells these numbers to users. `unfold` decompresses up to a bound.
+  place is reported. `tfbus.recording.open_recording` documents the bounds. `unfold` decompresses up to a bound.
 * Losses. `lost_message`, `unfinished`, `shortfalls` and `wrong_descriptions` make the reports that stand in place of
   missing messages.
 * Order. Chunks of a file may overlap in time. `merge_chunks` sorts their messages; `separate` finds the parts of an
@@ -106,9 +106,9 @@ class Channel:
     ----------
     topic, type : str
     encoding : str
-        Of the messages: ``"cdr"``, ``"ros1"``, ``"json"``, ``"protobuf"``.
+        The encoding of the messages: ``"cdr"``, ``"ros1"``, ``"json"``, ``"protobuf"``.
     schema_encoding : str
-        Of the definition: ``"ros2msg"``, ``"ros1msg"``, ``"jsonschema"``, ``"protobuf"``; empty without a definition.
+        The encoding of `schema`: ``"ros2msg"``, ``"ros1msg"``, ``"jsonschema"``, ``"protobuf"``; empty without one.
     schema : bytes
         The definition of the type; empty if the file has none.
     metadata : mapping of str to str
@@ -123,7 +123,7 @@ class Channel:
 
 
 StoredMessage = tuple[int, Channel | MalformedMessageError, bytes]
-"""Log time in ns, channel and payload of a message; an error in place of the channel says what was lost there."""
+"""Log time in ns, channel and payload of a message; an error in place of the channel describes a loss there."""
 Wanted = Callable[[Channel], bool]
 """Whether the messages of a channel are read."""
 
@@ -154,9 +154,9 @@ def unfinished(received: int, read: Counter[Channel], why: str) -> StoredMessage
 
 
 def in_words(error: Exception) -> str:
-    """The error of a parser in words for people: only a `ValueError` has them already."""
+    """The error of a parser in words for people; only a `ValueError` has such words already."""
     if isinstance(error, UnicodeDecodeError):
-        return "a text in it is no text"
+        return "a text in it is not UTF-8"
     return str(error) if isinstance(error, ValueError) else "it ends inside of a record, or a record is damaged"
 
 
@@ -169,7 +169,7 @@ def select(
 ) -> Iterator[StoredMessage]:
     """Iterate over the messages from one log time to another, inclusive, and count them by channel.
 
-    A message whose log time is no stamp becomes a lost one.
+    A message whose log time is not a stamp becomes a lost one.
     """
     low = STAMP_MIN if since is None else since
     high = STAMP_MAX if until is None else until
@@ -186,7 +186,7 @@ def select(
             if not block:
                 continue
         now = max(now, block[-1][0])
-        # Lost ones are counted as well, and not asked for.
+        # Lost messages are counted too; nobody reads their number.
         read.update(map(_channel, block))
         yield from block
 
@@ -215,7 +215,7 @@ def shortfalls(received: int, promised: Mapping[Channel, int], read: Counter[Cha
 
 
 def wrong_descriptions(received: int, kind: str, unknown: int, contradictory: set[int]) -> Iterator[StoredMessage]:
-    """The reports of channels that a file describes not at all, or in two ways.
+    """The reports of channels that a file does not describe, or describes in two ways.
 
     Parameters
     ----------
@@ -273,8 +273,8 @@ class Storage(Protocol):
     def messages(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[StoredMessage]:
         """Iterate over the messages of some channels from one log time to another, inclusive, in their order.
 
-        An iteration without limits ends with a report of what the file promises and does not have. One that reaches the
-        end of a file without its index ends with `unfinished`.
+        An iteration without limits ends with a report of the messages that the file promises and does not have. At the
+        end of a file without its index, an iteration ends with `unfinished`.
         """
         ...
 
@@ -287,7 +287,7 @@ _END = 2**64
 
 
 class ChunkPlace(NamedTuple):
-    """A chunk in an index: its log times in ns, and where it begins in the file."""
+    """A chunk in an index: its log times in ns, and its offset in the file."""
 
     start: int
     end: int
@@ -300,7 +300,7 @@ def merge_chunks(
     """Iterate over the messages of all chunks, many at once, in the order of their log times even if chunks overlap.
 
     Messages of the same log time stay in the order of the file. Only the messages of chunks that overlap are in memory;
-    beyond `MAX_OVERLAPPING` they come before it is known that they are in order, and that is told once.
+    beyond `MAX_OVERLAPPING` they may come out of order, and this is reported once.
 
     Parameters
     ----------
@@ -313,7 +313,7 @@ def merge_chunks(
     in_file_order = all(before.offset < after.offset for before, after in pairwise(places))
     waiting: list[StoredMessage] = []
     origins: list[int] = []
-    told = False
+    reported = False
     for number, place in enumerate(places, 1):
         following = places[number].start + in_file_order if number < len(places) else _END
         found = read(place)
@@ -329,8 +329,8 @@ def merge_chunks(
         ready = bisect_left(waiting, following, key=_log_time)
         if sum(MESSAGE_SIZE + len(payload) for _, _, payload in waiting[ready:]) > MAX_OVERLAPPING:
             ready = len(waiting)
-            if not told:
-                told = True
+            if not reported:
+                reported = True
                 detail = f"chunks of more than {MAX_OVERLAPPING:,} bytes overlap: their messages are not in order"
                 yield [lost_message(waiting[0][0], detail)]
         yield waiting[:ready]
@@ -365,7 +365,7 @@ _BLOCK: Final = 2**20
 
 
 class UnfoldError(ValueError):
-    """Compressed bytes that are damaged, or unfold to more than they may."""
+    """Compressed bytes that are damaged, or unfold to more than their bound."""
 
 
 def unfold(data: bytes, compression: str, limit: int, torn: bool = False, budget: UnfoldBudget | None = None) -> bytes:
@@ -379,7 +379,7 @@ def unfold(data: bytes, compression: str, limit: int, torn: bool = False, budget
     limit : int
         The greatest size of the result, in bytes.
     torn : bool
-        Whether the data may end too early; then the result is what they unfold to up to there.
+        Whether the data may end too early; then the result is their content up to the end.
     budget : UnfoldBudget, optional
         Counts the result down; damaged data count as `limit`.
 
@@ -474,7 +474,7 @@ _UNFOLD: Final = {"zstd": _unfold_zstd, "lz4": _unfold_lz4, "bz2": _unfold_bz2}
 
 BLOCK: Final = 8_192
 BLOCK_BYTES: Final = 2**22
-"""The greatest number of messages in a block of a storage that does not pack them; so many bytes fill it as well."""
+"""The greatest number of messages, and of bytes, in a block of a storage that does not pack messages."""
 _UNSIGNED: Final = 2**64
 
 Places = npt.NDArray[np.int64]
@@ -583,7 +583,7 @@ def in_order(messages: Packed, low: int, high: int) -> Iterator[Stored]:
     Parameters
     ----------
     messages : Packed
-        In the order of the file; a log time that is no stamp is negative.
+        In the order of the file; a log time that is not a stamp is negative.
     low, high : int
         In ns.
     """

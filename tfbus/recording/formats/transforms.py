@@ -4,12 +4,12 @@
   normalised, so a transform passes from one format to another without a change of any bit. The layout of a ROS message
   is a sequence of numbers and strings; in CDR each is aligned to its size (see `tfbus.tf_message`); in ROS 1 nothing is
   aligned, strings have no NUL, and a header begins with a sequence number.
-* `ChannelDecoder` decodes one message to samples, and tells what is wrong with each. Payloads that are not in CDR are
-  converted to it first.
+* `ChannelDecoder` decodes one message to samples, with an error for each bad transform. It converts payloads to CDR
+  first.
 * `ColumnDecoder` decodes many messages at once, with numpy. Most messages of a channel differ only in their stamps and
   numbers: the same frames are at the same bytes. So messages of one size are stacked to a matrix of bytes, and each
-  transform of the message becomes two slices of it. It gives the same bits as `ChannelDecoder`, or None for a block
-  with anything unusual, or that may be invalid; then `ChannelDecoder` takes the block.
+  transform of the message becomes two slices of it. It gives the same bits as `ChannelDecoder`. For a block with
+  anything unusual or possibly invalid it gives None, and `ChannelDecoder` decodes that block.
 """
 
 import json
@@ -239,11 +239,11 @@ def _protobuf_parser(channel: Channel, single: bool) -> Callable[[bytes], list[R
             ]
         except ImportError as error:
             raise MalformedMessageError(
-                "missing extra", f"to read it, tfbus needs a package more: {pip_install('foxglove')} ({error})"
+                "missing extra", f"to read it, tfbus needs one more package: {pip_install('foxglove')} ({error})"
             ) from None
         # The schema is in the file: a damaged one raises anything.
         except Exception as error:  # noqa: BLE001
-            raise MalformedMessageError("encoding", f"it is no message of its schema: {error!r}"[:200]) from None
+            raise MalformedMessageError("encoding", f"it is not a message of its schema: {error!r}"[:200]) from None
 
     return parse
 
@@ -256,13 +256,13 @@ def _protobuf_decoder(channel: Channel) -> Callable[[bytes], Any]:
     schema = Schema(id=1, name=channel.type, encoding="protobuf", data=channel.schema)
     decoder: Callable[[bytes], Any] | None = DecoderFactory().decoder_for("protobuf", schema)
     if decoder is None:
-        raise ValueError("its schema is no protobuf")
+        raise ValueError("its schema is not protobuf")
     return decoder
 
 
 def _raw(seconds: int, nanoseconds: int, parent: str, child: str, numbers: Sequence[float]) -> RawTransform:
     if not all(isinstance(number, int) for number in (seconds, nanoseconds)):
-        raise TypeError("a stamp is no integer")
+        raise TypeError("a stamp is not an integer")
     return RawTransform(seconds, nanoseconds, parent.encode(), child.encode(), _NUMBERS.pack(*numbers))
 
 
@@ -280,7 +280,7 @@ class ChannelDecoder:
     static : bool
         Whether its transforms are static.
     prefix : str
-        Put before the names of all frames, after leading slashes are removed.
+        A prefix for the names of all frames, after leading slashes are removed.
 
     Attributes
     ----------
@@ -343,7 +343,7 @@ class ChannelDecoder:
 
 
 def _authorities(channel: Channel) -> tuple[Run, ...]:
-    """The authorities in the metadata of a channel; the node that sent it, in ROS 1."""
+    """The authorities in the metadata of a channel; in ROS 1, the sending node."""
     text = channel.metadata.get(AUTHORITIES)
     if text is None:
         return ((channel.metadata.get("callerid", "").removeprefix("/"), 1),)
@@ -434,7 +434,7 @@ class _Values(NamedTuple):
     """ns."""
     rows: npt.NDArray[np.float64]
     """Shape (n, 7): translation and unit quaternion (x, y, z, w)."""
-    sound: npt.NDArray[np.bool_]
+    valid: npt.NDArray[np.bool_]
     """Whether it is valid for certain."""
 
 
@@ -520,7 +520,7 @@ class ColumnDecoder:
                 rest[places] = False
             for place, slot in enumerate(parts[0][0].slots):
                 values = _values(matrix, slot, decoder.channel.encoding == "cdr")
-                if not (values.sound | rest).all():
+                if not (values.valid | rest).all():
                     return False
                 for layout, places in parts:
                     frame = layout.slots[place]
@@ -588,7 +588,7 @@ def _fixed(matrix: npt.NDArray[np.uint8], ranges: Ranges) -> npt.NDArray[np.uint
 
 
 def _layout_of(payload: bytes, decoder: ChannelDecoder) -> _Layout | None:
-    """The layout of a message; None if it has none of the usual ones."""
+    """The layout of a message; None if it is unusual."""
     ros1 = decoder.channel.encoding == "ros1"
     if not ros1 and payload[:2] != b"\0\1":
         return None
@@ -630,13 +630,13 @@ def _layout_of(payload: bytes, decoder: ChannelDecoder) -> _Layout | None:
 
 
 def _values(matrix: npt.NDArray[np.uint8], slot: _Slot, signed: bool) -> _Values:
-    """One transform of each message; in those of another structure, it is any bytes."""
+    """One transform of each message; meaningless for messages of another structure."""
     times = np.ascontiguousarray(matrix[:, slot.stamp : slot.stamp + 8]).view("<u4")
     rows = np.ascontiguousarray(matrix[:, slot.numbers : slot.numbers + 56]).view("<f8")
     nanoseconds = times[:, 1]
-    sound = nanoseconds < SECOND
+    valid = nanoseconds < SECOND
     for axis in range(3):
-        sound &= np.abs(rows[:, axis]) < _LARGE
+        valid &= np.abs(rows[:, axis]) < _LARGE
     i, j, k, w = rows[:, 3], rows[:, 4], rows[:, 5], rows[:, 6]
     # Overflow and NaN are found by the comparison.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -644,14 +644,14 @@ def _values(matrix: npt.NDArray[np.uint8], slot: _Slot, signed: bool) -> _Values
         even = np.abs(square - 1.0) <= ROUNDING
         if not even.all():
             norm = np.sqrt(square)
-            sound &= np.abs(norm - 1.0) <= NORM_TOLERANCE
+            valid &= np.abs(norm - 1.0) <= NORM_TOLERANCE
             rows = rows.copy()
-            uneven = sound & ~even
+            uneven = valid & ~even
             rows[uneven, 3:] /= norm[uneven, None]
     seconds = times[:, 0].view(np.int32 if signed else np.uint32).astype(np.int64)
     if not signed:
-        sound &= seconds < 2**31
-    return _Values(seconds * SECOND + nanoseconds, rows, sound)
+        valid &= seconds < 2**31
+    return _Values(seconds * SECOND + nanoseconds, rows, valid)
 
 
 def _merge(parts: list[Columns]) -> Columns:

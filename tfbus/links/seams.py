@@ -1,26 +1,155 @@
-"""The seam below a link to another world, such as ROS, and the queue of what comes from there.
+"""The seams below a link: a wire to buses of tfbus, or a carrier to another world. An author of either reads this page.
 
-A carrier writes and reads messages of its world; see `tfbus.links.wire` for the seam below links between buses of
-tfbus, whose messages are the same over every network.
+A link of tfbus decides what is said, to whom and when, and what is news (`tfbus.links.domain`). Its `Wire` knows one
+network: it moves bytes between the links of one domain, and says which links are there. A new network is one class.
+
+Another world, such as ROS, has messages of its own. A link to it (`tfbus.links.endpoint.ForeignEnd`) decides what goes
+out and what is news as well; its `Carrier` writes and reads the messages of that world.
 """
 
 import enum
-import threading
-from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
 from tfbus.errors import InvalidTransformError
-from tfbus.links.outbox import Turn
-from tfbus.links.relay import ReceivedBatch
-from tfbus.statistics import QueueStatistics
+from tfbus.links.relay import ReceivedBatch, Turn
+from tfbus.tf_message import MalformedMessageError
 
-MANY = 100
-"""Moving items that wait, beyond which an answer overtakes those of its own sender too."""
-_MAX_BYTES = 64 * 2**20
-_OVERHEAD = 256
-"""Bytes that an item takes besides its content."""
+MAX_MESSAGE: Final = 2**22 + 2**16
+"""Bytes; no message is larger, and a wire refuses a larger one before it holds all of it in memory."""
+
+
+# Between buses of tfbus
+
+
+class Hearing(NamedTuple):
+    """The channel that a link hears of each link whose robot matches a pattern.
+
+    Attributes
+    ----------
+    robots : str
+        The name of a robot; ``*`` stands for any letters. A link without a robot has the name ``""``, which ``*`` alone
+        matches too.
+    channel : str
+        Letters, digits, ``-`` and ``_``, 32 at most.
+    """
+
+    robots: str
+    channel: str
+
+    def matches(self, robot: str) -> bool:
+        """Whether a robot has a name of the pattern; in linear time, for strangers choose the names."""
+        first, *others = self.robots.split("*")
+        if not others:
+            return robot == first
+        last = others.pop()
+        if len(robot) < len(first) + len(last) or not robot.startswith(first) or not robot.endswith(last):
+            return False
+        at, end = len(first), len(robot) - len(last)
+        for part in others:
+            # Each part may stand where it first occurs, so nothing is ever tried again.
+            at = robot.find(part, at, end)
+            if at < 0:
+                return False
+            at += len(part)
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """A link that this one means to hear is there; what was sent to it before may be lost."""
+
+    robot: str
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """A link is there no more. Nothing of it follows, unless it joins again."""
+
+
+WireItem = bytes | Joined | Left | MalformedMessageError
+"""An item that a wire brings of one link; the error is for a message that the wire has refused."""
+Receive = Callable[[str, WireItem], object]
+
+
+class Wire(Protocol):
+    """Moves messages between the links of one domain over one network.
+
+    A wire is used by one link, and opened once. The event loop calls everything here, in this order: `open`; then,
+    while `run` runs as a task, `publish` and `send`; when `run` has been cancelled, these once more, and `close`.
+
+    Attributes
+    ----------
+    id : str
+        The name of this link for all others: 32 hexadecimal digits, drawn at random.
+    """
+
+    id: str
+
+    async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
+        """Join the network, or begin to: where others are not there yet, `run` meets them later.
+
+        Parameters
+        ----------
+        hears : sequence of Hearing
+            The first that matches a link's robot is for that link; a link that none matches is not announced, and
+            nothing that it publishes comes to this process.
+        receive : callable
+            Takes the id of a link, and what has come of it: that it has joined or left, a message that it has published
+            on a channel which this link hears, or one that it has sent to this link. Messages that are sent to this
+            link come from all links of the domain, announced or not. Any thread may call it, from now until `close`
+            has returned and later; it never blocks and never raises. What one link has published comes in its order,
+            and so does what it has sent.
+        warn : callable
+            Takes an error of the network that the user should know; for the event loop only. It never raises.
+
+        Raises
+        ------
+        OSError
+            If there can be no network: an address is taken, or a directory is open to others. Whatever it raises, also
+            when it is cancelled, the link calls `close` next.
+        """
+
+    async def run(self) -> None:
+        """Do what takes time, such as connecting to others, until cancelled."""
+
+    def is_heard(self, channel: str) -> bool:
+        """Whether any link may hear a channel of this one; it does not block and does not raise."""
+
+    def is_behind(self) -> bool:
+        """Whether something has come that was not read yet, as far as the wire knows; it does not block."""
+        return False
+
+    def publish(self, channel: str, message: bytes) -> None:
+        """Send a message to all links that hear a channel of this one; it does not block and does not raise.
+
+        While the network, or one of the links, has no room, the message is dropped for those; the links find that out
+        by the numbers of messages.
+        """
+
+    def send(self, link: str, message: bytes) -> bool:
+        """Send a message to one link of the domain; it does not block and does not raise.
+
+        Where the network has an order for it, it goes before published messages that wait for room. It may be lost like
+        these.
+
+        Returns
+        -------
+        bool
+            False if it is known not to arrive, because the link is not there or has no room.
+        """
+
+    async def close(self) -> None:
+        """Disconnect, also if `open` has failed or was cancelled; all that was sent before still goes out.
+
+        The closing begins before the first checkpoint, because asyncio's own cancellation knows no shield, and returns
+        within about a second, whatever the network does.
+        """
+
+
+# To other worlds
 
 
 class Presence(enum.Enum):
@@ -202,99 +331,3 @@ class SplittingCarrier(Carrier, Protocol):
         MalformedMessageError
             If the rest of the message cannot be used; the parts before it are.
         """
-
-
-class ReceiveQueue:
-    """Holds what threads have received until the event loop reads it.
-
-    Items are read in order, but urgent ones, which bring two ends to agree, are read first: where nobody has time, the
-    others may wait for seconds. All that waits of a peer is read before its end, for it was sent before that, and
-    before its answer, which would else split batches. Only while more than `MANY` moving items wait, the answer does
-    not wait for them.
-
-    Parameters
-    ----------
-    capacity : int
-        How many moving items may be pending, within 64 MiB for all items together; beyond that the oldest moving items
-        are dropped, and when there are none, the oldest of the others. What is to be read first is dropped last.
-    """
-
-    def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
-        self._lock = threading.Lock()
-        self._urgent: deque[Received] = deque()
-        # Items that do not move and were passed over in a search for the oldest moving one.
-        self._kept: deque[Received] = deque()
-        self._pending: deque[Received] = deque()
-        self._bytes = 0
-        self._moving = 0
-        self._dropped = 0
-
-    def __len__(self) -> int:
-        return len(self._urgent) + len(self._kept) + len(self._pending)
-
-    def put(self, item: Received) -> None:
-        """Append an item, from any thread."""
-        with self._lock:
-            if item.urgent:
-                if item.content is Presence.LEFT or (item.follows and self._moving <= MANY):
-                    self._hurry(item.sender)
-                self._urgent.append(item)
-            else:
-                self._pending.append(item)
-            self._bytes += _footprint(item)
-            self._moving += item.moving
-            while self._moving > self._capacity or self._bytes > _MAX_BYTES:
-                self._drop_oldest()
-
-    def get(self) -> Received | None:
-        """Remove and return the oldest item; None if the queue is empty."""
-        with self._lock:
-            for queue in (self._urgent, self._kept, self._pending):
-                if queue:
-                    return self._pop(queue)
-        return None
-
-    def discard_moving(self) -> None:
-        """Drop all moving items, because the clock has jumped back."""
-        with self._lock:
-            for queue in (self._urgent, self._kept, self._pending):
-                kept = [item for item in queue if not item.moving]
-                queue.clear()
-                queue.extend(kept)
-            self._dropped += self._moving
-            self._bytes = sum(map(_footprint, (*self._urgent, *self._kept, *self._pending)))
-            self._moving = 0
-
-    def statistics(self) -> QueueStatistics:
-        """The queue's counters, in items."""
-        with self._lock:
-            return QueueStatistics("link", "drop_oldest", self._capacity, len(self), self._dropped)
-
-    def _drop_oldest(self) -> None:
-        while self._pending and not self._pending[0].moving:
-            self._kept.append(self._pending.popleft())
-        if self._moving and not self._pending:
-            self._pop(self._urgent, next(place for place, item in enumerate(self._urgent) if item.moving))
-        else:
-            self._pop(self._pending or self._kept or self._urgent)
-        self._dropped += 1
-
-    def _pop(self, queue: deque[Received], place: int = 0) -> Received:
-        item = queue[place]
-        del queue[place]
-        self._bytes -= _footprint(item)
-        self._moving -= item.moving
-        return item
-
-    def _hurry(self, sender: str) -> None:
-        """Have all that waits of a peer read before what waits of others."""
-        for queue in (self._kept, self._pending):
-            waiting = list(queue)
-            queue.clear()
-            for item in waiting:
-                (self._urgent if item.sender == sender else queue).append(item)
-
-
-def _footprint(item: Received) -> int:
-    return item.size + _OVERHEAD

@@ -12,8 +12,8 @@ import zenoh
 from support.processes import free_address, until
 from support.zenoh_wires import LIVE, listening, met, talk
 
-from tfbus.links.wire import MAX_MESSAGE, Joined
-from tfbus.links.zenoh.addresses import (
+from tfbus.links.seams import MAX_MESSAGE, Joined
+from tfbus.links.zenoh.sessions import (
     LEASE,
     SIGNS_OF_LIFE,
     Addresses,

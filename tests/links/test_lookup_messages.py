@@ -15,11 +15,10 @@ from tfbus import (
     Transform,
     TransformStamped,
 )
-from tfbus.links.remote_lookup import (
-    MAX_BYTES,
+from tfbus.links.message import (
+    MAX_LOOKUP,
     Cancellation,
     RemoteQuestion,
-    as_timeout,
     read_answer,
     read_question,
     write_answer,
@@ -42,9 +41,9 @@ def test_a_question_and_its_cancellation_are_read_as_they_were_written(message: 
 
 
 def test_so_large_a_message_is_read_and_no_larger_one() -> None:
-    largest = write_question(Cancellation("me", 2)).ljust(MAX_BYTES)
+    largest = write_question(Cancellation("me", 2)).ljust(MAX_LOOKUP)
     assert read_question(largest) == Cancellation("me", 2)
-    with pytest.raises(ValueError, match=f"{MAX_BYTES + 1} bytes, more than {MAX_BYTES}"):
+    with pytest.raises(ValueError, match=f"{MAX_LOOKUP + 1} bytes, more than {MAX_LOOKUP}"):
         read_question(largest + b" ")
 
 
@@ -61,7 +60,7 @@ def test_so_large_a_message_is_read_and_no_larger_one() -> None:
         b'{"type": %b, "message": "m", "cause": null}' % (b"[" * 300 + b"]" * 300),
         b'{"type": "ValueError", "message": ["m"]}',
         b'{"type": {}, "message": "m"}',
-        write_question(Cancellation("m" * MAX_BYTES, 1)),
+        write_question(Cancellation("m" * MAX_LOOKUP, 1)),
     ],
 )
 def test_other_bytes_are_no_question_and_no_answer(data: bytes) -> None:
@@ -70,24 +69,6 @@ def test_other_bytes_are_no_question_and_no_answer(data: bytes) -> None:
     error = read_answer(data, "tf", "r1")
     assert isinstance(error, RemoteLookupError)
     assert (error.domain, error.robot, error.reason) == ("tf", "r1", "malformed")
-
-
-def test_an_answer_and_each_kind_of_error_come_back_with_their_facts() -> None:
-    answer = TransformStamped("map", "base", 7, Transform((0.1, 0.2, 1 / 3)))
-    assert read_answer(write_answer(answer), "tf", None) == answer
-    late = LookupTimeoutError(target="map", source="base", timeout=0.5, missing=SHORT)
-    late.__cause__ = SHORT
-    back = read_answer(write_answer(late), "tf", None)
-    assert isinstance(back, LookupTimeoutError)
-    assert isinstance(back.__cause__, FutureExtrapolationError)
-    assert (str(back), back.__cause__.newest, back.__cause__.authority) == (str(late), 5, "odometry")
-    for error in (TypeError("a float"), ValueError("too long")):
-        again = read_answer(write_answer(error), "tf", None)
-        assert (type(again), str(again)) == (type(error), str(error))
-
-
-def test_the_server_waits_no_longer_than_its_own_limit() -> None:
-    assert [as_timeout(timeout, 10.0) for timeout in (None, math.nan, math.inf, 20.0, 3.0)] == [10.0] * 4 + [3.0]
 
 
 QUESTION = RemoteQuestion("me", 2, "map", "base", 7, 0.5, 1.0, LATEST, "odom", 0.3, 0.2, 0.1)

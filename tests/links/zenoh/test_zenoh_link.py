@@ -1,0 +1,60 @@
+"""`ZenohLink` at the door: its promises beyond those that the tests of the wire hold."""
+
+import gc
+import sys
+import threading
+import weakref
+
+import anyio
+import pytest
+from support.processes import Program, until
+
+from tfbus import Bus, Transform, TransformBroadcaster
+from tfbus.errors import pip_install
+from tfbus.links.zenoh import ZenohLink, ZenohRouter
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_without_zenoh_the_import_names_the_extra() -> None:
+    program = "import sys; sys.modules['zenoh'] = None; import tfbus.links.zenoh"
+    with Program(sys.executable, "-c", program) as done:
+        assert done.wait() == 1
+        assert done.errors.text.splitlines()[-1].endswith(f"a package more: {pip_install('zenoh')}")
+
+
+async def test_links_that_have_ended_are_freed_with_their_threads(address: str, domain: str) -> None:
+    ended: weakref.WeakSet[object] = weakref.WeakSet()
+
+    async def join_for_a_moment(number: int) -> None:
+        with Bus() as bus:
+            TransformBroadcaster(bus).send_static("map", f"{number}", Transform())
+            async with ZenohLink(bus, domain, connect=address) as link:
+                ended.update((bus, link))
+                await until(lambda: bool(link.peers and stays.peers))
+            await until(lambda: not stays.peers)
+
+    with Bus() as own:
+        async with ZenohRouter(address), ZenohLink(own, domain, connect=address) as stays:
+            # What is made once for all links is there.
+            await join_for_a_moment(0)
+            threads = threading.active_count()
+            for number in range(1, 31):
+                await join_for_a_moment(number)
+            gc.collect()
+            assert len(ended) == 0
+            assert threading.active_count() <= threads
+            assert own.statistics().frames == 31
+
+
+@pytest.mark.thorough
+@pytest.mark.every_loop
+async def test_a_link_that_is_cancelled_while_it_begins_to_listen_frees_its_address(address: str, domain: str) -> None:
+    for tenths in range(60):
+        with Bus() as bus, anyio.move_on_after(tenths / 10_000) as scope:
+            async with ZenohLink(bus, domain, listen=address):
+                await anyio.sleep_forever()
+        assert scope.cancelled_caught
+    with Bus() as bus:
+        async with ZenohLink(bus, domain, listen=address):
+            pass
