@@ -269,10 +269,10 @@ def test_what_a_lost_bus_has_said_does_not_take_a_frame_over_when_it_is_late_and
     listener = world.process(network, drop_lost=drop_lost)
     old, new, bridge = (Stranger(network) for _ in range(3))
     said = old.batch(moving("map", "base", 1), number=10)
+    sayings = [(old, said), (new, new.batch(moving("map", "base", 2), number=20))]
     # A program that was started again may be read first.
-    sayings = [lambda: old.say(said), lambda: new.say(new.batch(moving("map", "base", 2), number=20))]
-    for say in sayings[:: -1 if late else 1]:
-        say()
+    for speaker, batch in sayings[:: -1 if late else 1]:
+        speaker.say(batch)
     network.remove(old)
     world.run(1.0)
     assert listener.frames == {"base": moving("map", "base", 2)}

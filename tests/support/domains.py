@@ -121,7 +121,12 @@ class Network:
         """Cut a link off from all others, which notice that after a while, unless the network has healed by then."""
         cut = {pair for other in self.wires if other is not wire for pair in ((other, wire), (wire, other))}
         self.cuts |= cut
-        self.world.arrive(wire, self, lambda: [one.part(other) for other, one in cut & self.cuts], lease)
+
+        def notice() -> None:
+            for other, one in cut & self.cuts:
+                one.part(other)
+
+        self.world.arrive(wire, self, notice, lease)
 
     def heal(self) -> None:
         self.cuts.clear()

@@ -436,10 +436,12 @@ async def test_the_end_of_a_killed_process_is_seen_and_its_name_removed(
 ) -> None:
     wire = LocalWire(DOMAIN, directory=directory, loopback=loopback)
     async with AsyncExitStack() as stack:
-        ear = await stack.enter_async_context(running(wire)) if younger else None
-        program = stack.enter_context(start_peer(directory, loopback=loopback))
+        if not younger:
+            program = stack.enter_context(start_peer(directory, loopback=loopback))
+        ear = await stack.enter_async_context(running(wire))
+        if younger:
+            program = stack.enter_context(start_peer(directory, loopback=loopback))
         peer = (await expect(program, "^open")).split()[1]
-        ear = ear or await stack.enter_async_context(running(wire))
         await ear.joined(peer)
         assert len(files_in(directory)) == 2
         program.process.kill()
