@@ -338,7 +338,7 @@ class Process:
         self.ends: list[Endpoint] = [*self.domain_ends, *self.foreign_ends]
         self.frames: dict[str, TransformStamped] = {}
         self.seen: list[TransformStamped] = []
-        # What was heard more than once; what was taken off the bus because its owner was lost may be put back.
+        # The samples that were heard more than once; a frame of a lost owner may be taken off the bus and put back.
         self.again: list[TransformStamped] = []
         self._ever: dict[str, set[int]] = {}
         self.batches: list[Batch] = []
