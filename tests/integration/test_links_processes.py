@@ -113,7 +113,7 @@ def test_processes_may_start_in_any_order(processes: Crowd, place: Place) -> Non
     late.ask("until", static=["again"])
 
 
-@pytest.mark.parametrize("drop_lost", [False, True])
+@pytest.mark.parametrize("drop_lost", [False, pytest.param(True, marks=thorough)])
 def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_late_joiners_and_restarted_ones(
     drop_lost: bool, processes: Crowd, place: Place
 ) -> None:

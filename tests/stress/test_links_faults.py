@@ -36,7 +36,7 @@ def tell(capsys: pytest.CaptureFixture[str], line: str) -> None:
         print(f"\n{line}")
 
 
-@DROP_LOST
+@pytest.mark.parametrize("drop_lost", [pytest.param(False, marks=pytest.mark.thorough), True])
 def test_a_few_faults_on_one_machine_leave_all_buses_equal(processes: Crowd, directory: Path, drop_lost: bool) -> None:
     world = OneMachine(processes, 0, drop_lost, directory)
     world.longest_pauses = 2
@@ -53,6 +53,7 @@ def test_all_buses_of_one_machine_are_equal_after_each_fault(
     tell(capsys, OneMachine(processes, seed, drop_lost, directory, loopback).run(seconds=SECONDS))
 
 
+@pytest.mark.thorough
 def test_a_few_faults_of_a_router_leave_all_buses_equal(processes: Crowd) -> None:
     pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
     with Routers(processes, 0, drop_lost=False, routers=1, apart=None) as world:

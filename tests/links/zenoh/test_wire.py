@@ -124,8 +124,9 @@ async def test_messages_of_both_kinds_come_in_the_order_in_which_they_went(addre
                 one.wire.publish(LIVE, message)
             else:
                 one.wire.send(two.id, message)
-            await anyio.lowlevel.checkpoint()
-        await until(lambda: len(two.messages) == len(sent))
+            if number % 20 == 19:
+                # A network without room may drop published messages.
+                await until(lambda: len(two.messages) == number + 1)  # noqa: B023
     assert [message for _, message in two.messages] == sent
 
 
