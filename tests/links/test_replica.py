@@ -102,6 +102,7 @@ class Asker:
     def __init__(self, *peers: str) -> None:
         random.seed(1)
         self.now = 0.0
+        self.is_behind = False
         self.replica = Replica(1_000, OWN)
         self.agreement = Agreement()
         self.peers = {peer: Replica(1_000, peer.encode()) for peer in peers}
@@ -122,7 +123,7 @@ class Asker:
     def next_question(self, within: float = 1e6) -> Question | None:
         """Let time pass until there is a question."""
         end = self.now + within
-        while (question := self.agreement.question(self.now)) is None:
+        while (question := self.agreement.question(self.now, self.is_behind)) is None:
             if self.agreement.next_due() > end:
                 self.now = end
                 return None
@@ -244,6 +245,38 @@ def test_a_silent_peer_without_a_sign_of_life_is_asked_ever_less_often_and_other
     assert 59.9 < max(found) < 60.1
     link.agreement.joined("b", link.replica, link.now, must_ask=True)
     assert link.next_question(0.0) == Question("b", 0)
+
+
+def test_a_link_that_is_behind_asks_only_the_first_question_at_once_and_one_in_ten_seconds() -> None:
+    link = Asker("a", "b")
+    link.is_behind = True
+    link.say("a", heard=False)
+    link.answer(link.next_question(0.0) or Question("", 0))
+    for peer in ("a", "b"):
+        link.say(peer, heard=False)
+        link.sign(peer)
+        link.agreement.missed(peer, link.now)
+    asked = []
+    for _ in range(2):
+        asked_from = link.now
+        question = link.next_question()
+        assert question is not None
+        assert 9.9 <= link.now - asked_from <= 10.5
+        link.answer(question)
+        asked.append(question.peer)
+    assert sorted(asked) == ["a", "b"]
+
+
+def test_what_a_link_has_read_meanwhile_is_not_asked_for() -> None:
+    link = Asker("a")
+    link.answer(link.next_question(0.0) or Question("", 0))
+    link.say("a", heard=False)
+    link.sign("a")
+    link.is_behind = True
+    assert link.next_question(5.0) is None
+    link.replica.note("f1", (1, OTHER), static("map", "f1"))
+    link.is_behind = False
+    assert link.next_question() is None
 
 
 def test_an_answer_that_leads_nowhere_or_was_not_asked_for_changes_nothing() -> None:

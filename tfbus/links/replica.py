@@ -588,7 +588,9 @@ class Agreement:
                 return None
             copy = self._copies[peer]
             again = copy.again <= now
-            copy.due = copy.again = self._latest = inf
+            copy.due = copy.again = inf
+            if not copy.urgent:
+                self._latest = inf
             copy.urgent = False
             if again or copy.missed or not self._agrees(copy, now):
                 self._asked, self._patience = Question(peer, copy.seen), now + PATIENCE
