@@ -59,7 +59,8 @@ nitpick_ignore_regex = [
     # The parts of a recording for code that reads it in blocks.
     ("py:class", r"tfbus\.recording\.(recording\.(Decoded)?Block|formats\.\w+\.RawTransform)"),
     # The parts of a link, and the follower of a clock.
-    ("py:class", r"tfbus\.links\.(clock_follower\.HearsTime|endpoint\.Endpoint|wire\.Wire|lookups\.Serving)"),
+    ("py:class", r"tfbus\.links\.(endpoint\.(HearsTime|Endpoint)|seams\.Wire|lookups\.Serving)"),
+    ("py:class", r"tfbus\._aio\.turn_budget\.TurnBudget"),
     ("py:class", r"tfbus\.links\.(link\.DomainOptions|ros\.\w+\.(RosCarrier|RosOptions))"),
     # Sphinx splits the parameters of such types.
     ("py:class", r"[\w.]+\[\w+"),
