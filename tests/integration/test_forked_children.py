@@ -171,6 +171,8 @@ async def main():
             )
             child.start()
             await anyio.to_thread.run_sync(child.join)
+            while len(link.peers) > 1:
+                await anyio.sleep(0.01)
             print(len(link.peers))
             with bus.events() as events:
                 print([type(event).__name__ for event in iter(events.queue.get, None)])
