@@ -14,6 +14,7 @@ from support.processes import peak_of
 from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, PeerLost, SimulatedClock, TransformStamped
+from tfbus.links.message import Kind
 from tfbus.links.relay import PassedSamples, ReceivedTransform
 from tfbus.tf_message import decode, encode
 
@@ -261,8 +262,9 @@ def test_a_frame_that_a_lost_bus_has_taken_over_is_gone_until_it_is_said_again()
 
 @pytest.mark.parametrize("drop_lost", [False, True])
 @pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("reached_again", [False, True])
 def test_what_a_lost_bus_has_said_does_not_take_a_frame_over_when_it_is_late_and_is_not_heard_again(
-    late: bool, drop_lost: bool
+    reached_again: bool, late: bool, drop_lost: bool
 ) -> None:
     world = World()
     network = Network(world)
@@ -276,6 +278,8 @@ def test_what_a_lost_bus_has_said_does_not_take_a_frame_over_when_it_is_late_and
     network.remove(old)
     world.run(1.0)
     assert listener.frames == {"base": moving("map", "base", 2)}
+    if reached_again:
+        bridge.say(kind=Kind.SIGN, reach=[(old.bus, ())])
     bridge.say(said)
     assert len(listener.seen) == 2
 

@@ -121,7 +121,6 @@ def test_what_comes_again_or_late_is_counted_and_what_this_bus_has_said_is_no_ne
     for number in (2, 2, 1, 3):
         scene.say(moving("map", "a", number), number=number)
     assert scene.counts == (2, 2)
-    scene.stranger.say(kind=Kind.SIGN, reach=[(OTHER, ())])
     scene.say(moving("map", "a", 2), number=2, origin=OTHER)
     assert scene.counts == (3, 2), "another origin is another source"
     scene.say(static("map", "own"), number=0, origin=scene.origin)

@@ -443,17 +443,10 @@ class DomainEnd(Endpoint):
                 assert peer is not None
                 self.reject(peer.id, "too many frames", error)
                 continue
-            if is_new or (live and not static and self._may_be_news(replica.entries[child], provenance.origin)):
+            # Of a moving frame, every live sample counts; the relay knows which of them have come before.
+            if is_new or (live and not static and _moves(replica.entries[child])):
                 kept.append(sample)
         return kept
-
-    def _may_be_news(self, entry: Entry, origin: bytes) -> bool:
-        """Whether a live sample that moves a frame, and is not the newest of it, may be one that has not come before.
-
-        Every such sample counts. The relay knows which have come before, but for those of a lost bus, which it forgets.
-        """
-        moves = entry.sample is not None and not entry.sample.static
-        return moves and (entry.origin == origin or self.relay.reaches(origin))
 
     def _wanted(self, samples: list[ReceivedTransform]) -> list[ReceivedTransform]:
         frames = self.frames
@@ -548,7 +541,6 @@ class DomainEnd(Endpoint):
         frames = tuple(self.relay.frames_of(lost))
         if self.drop_lost:
             self.relay.withdraw(frames, lost)
-        self.relay.forget_origins(lost)
         return frames
 
     def _forget(self, peer: Peer) -> set[bytes]:
@@ -586,7 +578,6 @@ class DomainEnd(Endpoint):
         if self.drop_lost:
             self.relay.withdraw(self.relay.frames_of(lost), lost)
             self._show(peer, set(opened))
-        self.relay.forget_origins(lost)
 
     def _show(self, peer: Peer, buses: Collection[bytes]) -> None:
         """Publish what the copies hold of buses to which a way leads again."""
@@ -694,3 +685,7 @@ class _Due(NamedTuple):
 
     kind: Kind
     data: bytes
+
+
+def _moves(entry: Entry) -> bool:
+    return entry.sample is not None and not entry.sample.static

@@ -24,7 +24,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import groupby, islice
 from math import inf
 from time import time_ns
 from typing import Any
@@ -41,6 +41,8 @@ LARGEST_JUMP = 2**52
 MANY_PEERS = 20
 """All origins together may have so many times the frames that one of them may have."""
 MAX_ORIGINS = 10_000
+MOST_LOST = 1_000
+"""The numbers of so many lost buses are remembered, because copies of their samples may still be on the way."""
 _LEAP = 2**16
 """A bus skips so many numbers behind one that somebody has made up in its name, for the next ones are mostly taken."""
 _REMEMBERED = 10_000
@@ -320,6 +322,8 @@ class Relay:
         self._removed: dict[str, Rank] = {}
         self._removing: tuple[str, Provenance | None] | None = None
         self._ways: Counter[bytes] = Counter()
+        # The buses to which no way leads any more, in the order in which they were lost.
+        self._lost: dict[bytes, None] = {}
         self._passed: PassedSamples | None = None
 
     def attach(self, outbox: Outbox, foreign: bool = False) -> None:
@@ -352,7 +356,7 @@ class Relay:
         if not self._outboxes:
             self._registration.close()
             self._frames = 0
-            for held in (self._newest, self._held, self._latest, self._settled, self._removed):
+            for held in (self._newest, self._held, self._latest, self._settled, self._removed, self._lost):
                 held.clear()
             self._passed = None
 
@@ -478,6 +482,7 @@ class Relay:
     def way_opened(self, origin: bytes) -> None:
         """Count one more way to a bus."""
         self._ways[origin] += 1
+        self._lost.pop(origin, None)
 
     def way_closed(self, origin: bytes) -> bool:
         """Count one way less to a bus; returns whether that was the last one."""
@@ -485,6 +490,9 @@ class Relay:
         if self._ways[origin] > 0:
             return False
         del self._ways[origin]
+        self._lost[origin] = None
+        if len(self._lost) > MOST_LOST:
+            self._forget_lost()
         return True
 
     def reach_besides(self, outbox: Outbox) -> dict[bytes, tuple[bytes, ...]]:
@@ -506,15 +514,6 @@ class Relay:
     def frames_of(self, origins: Collection[bytes]) -> list[str]:
         """The frames on the bus whose newest sample is of one of some buses, sorted."""
         return sorted(frame for frame, latest in self._latest.items() if latest.origin in origins)
-
-    def forget_origins(self, origins: Collection[bytes]) -> None:
-        """Forget the numbers of buses that have gone, but for those of frames that are here."""
-        if origins:
-            for frame, newest in list(self._newest.items()):
-                latest = self._latest.get(frame)
-                for origin in newest.keys() & origins:
-                    if latest is None or latest.origin != origin:
-                        self._release(origin, frame)
 
     def mask(self, provenance: Provenance, samples: Sequence[TransformStamped]) -> None:
         """Withdraw frames of which a lost bus was the last to speak, until a way leads to it or others speak."""
@@ -552,8 +551,9 @@ class Relay:
         sequence, origin = provenance.sequence, provenance.origin
         self._number = max(self._number, sequence)
         rank = provenance.rank
-        if origin not in self._held and len(self._held) >= MAX_ORIGINS:
-            return len(list(samples))
+        while origin not in self._held and len(self._held) >= MAX_ORIGINS:
+            if not self._forget_lost():
+                return len(list(samples))
         passed, foreign = self._passed, origin == self.origin
         settled, removed = self._settled, self._removed
         for sample in samples:
@@ -567,6 +567,8 @@ class Relay:
             known = None if newest is None else newest.get(origin)
             if known is None:
                 held = len(peer.frames) if foreign else self._held[origin]
+                while self._frames >= MANY_PEERS * max_frames and self._forget_lost():
+                    pass
                 if held >= max_frames or self._frames >= MANY_PEERS * max_frames:
                     refused += 1
                     continue
@@ -655,6 +657,21 @@ class Relay:
                 del self._removed[next(iter(self._removed))]
         for origin in list(self._newest.get(frame, ())):
             self._release(origin, frame)
+
+    def _forget_lost(self) -> bool:
+        """Forget the numbers of the half that was lost first, but for those of frames that are here; False without any.
+
+        They are not forgotten when a bus is lost, because a copy of its samples may come later and would be news again.
+        """
+        gone = set(islice(self._lost, (len(self._lost) + 1) // 2))
+        for origin in gone:
+            del self._lost[origin]
+        for frame, newest in list(self._newest.items()) if gone else ():
+            latest = self._latest.get(frame)
+            for origin in newest.keys() & gone:
+                if latest is None or latest.origin != origin:
+                    self._release(origin, frame)
+        return bool(gone)
 
     def _release(self, origin: bytes, frame: str) -> None:
         newest = self._newest[frame]
