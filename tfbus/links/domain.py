@@ -157,22 +157,18 @@ class DomainEnd(Endpoint):
             self.handle(sender, _Due(kind, self._questions.pop((sender, kind))))
             after = self._now()
             now, self._answers_due = after, 2 * after - now
-        is_due = now >= self._agreement.next_due()
-        is_behind = is_due and (self.host.is_behind() or self._wire.is_behind())
-        question = self._agreement.question(now, is_behind) if is_due else None
-        if question is not None:
-            frames = sorted(self.frames) if self.frames is not None and self._filters else None
-            text = write_text(Kind.QUESTION, {"since": question.since, "frames": frames})
-            if not self._wire.send(question.peer, text):
-                self._agreement.unanswered(question.peer, now)
+        if self._history is not None:
+            for peer in self._history.overdue():
+                self._end_history(peer)
+        due = self._agreement.next_due()
+        if now >= due:
+            self._ask(now)
+            due = self._agreement.next_due()
         if now >= self._sign_due:
             peers = len(self.present)
             self._sign_period = min(2 * self._sign_period, max(LONGEST_SIGN_PERIOD, LONGEST_SIGN_PERIOD_EACH * peers))
             self._sign(now)
-        if self._history is not None:
-            for peer in self._history.overdue():
-                self._end_history(peer)
-        due = min(self._agreement.next_due(), self._sign_due, self._answers_due if self._questions else inf)
+        due = min(due, self._sign_due, self._answers_due if self._questions else inf)
         if self._history is not None:
             due = min(due, self._history.next_due())
         if self._wire.is_heard(SLOW):
@@ -181,6 +177,15 @@ class DomainEnd(Endpoint):
                 self._channels.send_slowly()
             due = min(due, self._slow_due)
         return due
+
+    def _ask(self, now: float) -> None:
+        """Ask the question that is due, unless it is put off."""
+        question = self._agreement.question(now, self.host.is_behind() or self._wire.is_behind())
+        if question is not None:
+            frames = sorted(self.frames) if self.frames is not None and self._filters else None
+            text = write_text(Kind.QUESTION, {"since": question.since, "frames": frames})
+            if not self._wire.send(question.peer, text):
+                self._agreement.unanswered(question.peer, now)
 
     def split(self, item: Received) -> Iterator[Any]:
         if not isinstance(item.content, bytes):
@@ -370,11 +375,12 @@ class DomainEnd(Endpoint):
     def _take_held(self, peer: Peer, heard: Heard) -> None:
         now = self._now()
         live = heard.kind is Kind.LIVE
-        if not live:
+        numbered = not heard.continues and (live or heard.kind is Kind.SIGN)
+        is_gap = numbered and self._count_gap(peer, heard.number, live)
+        if is_gap or not live:
             self._resting.pop(peer.id, None)
-        if not heard.continues and (live or heard.kind is Kind.SIGN) and self._count_gap(peer, heard.number, live):
+        if is_gap:
             self._agreement.missed(peer.id, now)
-            self._resting.pop(peer.id, None)
             self.host.stir()
         if heard.kind is Kind.PAST:
             self._take_past(peer, heard)
