@@ -17,8 +17,8 @@ from support.memory_wire import MemoryNetwork, MemoryWire
 from support.processes import until
 from support.samples import moving, static
 
-from tfbus import Bus, BusClosedError, SimulatedClock
-from tfbus.links import DomainLink
+from tfbus import Buffer, Bus, BusClosedError, SimulatedClock
+from tfbus.links import BufferServer, DomainLink
 from tfbus.links.message import MAX_SAMPLES, Kind, Outgoing, kind_of, write_message
 from tfbus.links.relay import OutgoingBatch
 from tfbus.links.seams import Hearing, Receive
@@ -231,6 +231,26 @@ async def test_a_link_that_nobody_enters_says_so() -> None:
     assert [record for record in records if "never entered" in record] == [
         "a DomainLink was made and never entered, so it has done nothing: write `async with DomainLink(...)`"
     ]
+
+
+@pytest.mark.every_loop
+async def test_a_link_that_is_used_in_another_event_loop_says_so(anyio_backend_name: str) -> None:
+    async def use(link: DomainLink) -> None:
+        for use in (
+            lambda: link.lookup("map", "base"),
+            link.__aenter__,
+            lambda: link.__aexit__(None, None, None),
+            BufferServer(buffer, link).__aenter__,
+        ):
+            with pytest.raises(RuntimeError, match="'tf': 0 peers> was entered in another event loop"):
+                await use()
+
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with DomainLink(bus, "tf", MemoryNetwork().wire()) as link:
+            await anyio.to_thread.run_sync(lambda: anyio.run(use, link, backend=anyio_backend_name))
+            with pytest.raises(RuntimeError, match="entered once"):
+                await link.__aenter__()
+        assert repr(link) == "<DomainLink 'tf': not joined>"
 
 
 def test_after_a_crash_of_the_event_loop_what_comes_does_no_harm_and_what_is_published_says_so(
