@@ -17,7 +17,7 @@ from support.memory_wire import MemoryNetwork, MemoryWire
 from support.processes import until
 from support.samples import moving, static
 
-from tfbus import Buffer, Bus, BusClosedError, SimulatedClock
+from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, TransformStamped
 from tfbus.links import BufferServer, DomainLink
 from tfbus.links.message import MAX_SAMPLES, Kind, Outgoing, kind_of, write_message
 from tfbus.links.relay import OutgoingBatch
@@ -231,6 +231,32 @@ async def test_a_link_that_nobody_enters_says_so() -> None:
     assert [record for record in records if "never entered" in record] == [
         "a DomainLink was made and never entered, so it has done nothing: write `async with DomainLink(...)`"
     ]
+
+
+async def test_a_bus_that_links_again_hears_and_says_nothing_twice() -> None:
+    network = MemoryNetwork()
+    with Bus() as bus, Bus() as other:
+        heard: list[TransformStamped] = []
+        said: list[TransformStamped] = []
+        async with DomainLink(other, "tf", network.wire()) as peer:
+            async with DomainLink(bus, "tf", network.wire()) as link:
+                other.publish([static("map", "camera"), static("map", "lidar"), moving("map", "base", 1)])
+                bus.publish(static("map", "own"))
+                await until(lambda: (bus.statistics().frames, other.statistics().frames) == (4, 4))
+            await until(lambda: not peer.peers)
+            bus.remove_frame("lidar")
+            bus.publish(static("map", "meanwhile"))
+            for samples, each in ((heard, bus), (said, other)):
+                each.subscribe(samples.extend)
+                samples.clear()
+            async with DomainLink(bus, "tf", network.wire()) as link:
+                await until(lambda: len(heard) == 1 and len(said) == 1)
+                other.publish(moving("map", "base", 2))
+                await until(lambda: len(heard) == 2)
+                assert link.peers == (peer.id,)
+        # The frame that was removed without a link comes back, for others still have it.
+        assert heard == [static("map", "lidar"), moving("map", "base", 2)]
+        assert said == [static("map", "meanwhile"), moving("map", "base", 2)]
 
 
 @pytest.mark.every_loop

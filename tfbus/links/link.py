@@ -548,7 +548,7 @@ class DomainLink(Link):
 
     @property
     def lookups(self) -> RemoteLookups:
-        """The lookups of the link, for a `BufferServer`; raises `RuntimeError` unless it is entered in this event loop."""
+        """For a `BufferServer`: the lookups of the link; raises `RuntimeError` unless it is entered in this loop."""
         if not self._attached:
             self.bus._check_thread()
             raise RuntimeError("the link is not entered")
