@@ -1,6 +1,6 @@
 """The kernel in Python: samples, edges and paths, and the plain judgement, commit and answer.
 
-This is the definition. ``tfbus/_kernel.c`` does the same, with the same bits, and runs in its place where it could be
+This is the definition. ``tfbus/_c_kernel/`` does the same, with the same bits, and runs in its place where it could be
 built. Both hand back a case that is not plain: the caller then decides, and raises the errors.
 
 The samples are stored by column: stamps for `bisect`, and one 64-byte record a sample (stamp, translation, rotation),

@@ -3,7 +3,7 @@
 The environment variable ``TFBUS_KERNEL`` asks for ``python`` or ``compiled``. Without it, the compiled kernel runs if
 it was built and can be loaded.
 
-`tfbus._python_kernel` is the definition: ``_kernel.c`` does the same, with the same bits. The fast path of publishing
+`tfbus._python_kernel` is the definition: ``_c_kernel/`` does the same, with the same bits. The fast path of publishing
 exists in C only, because in Python it would not be faster than the ordinary path: `Intake` takes a plain batch, and the
 `Feed` of each buffer stores it and wakes the lookups that waited for it.
 """
