@@ -34,7 +34,7 @@ def processes() -> Iterator[Crowd]:
         yield together
 
 
-@pytest.fixture(params=["local", "router"])
+@pytest.fixture(params=["local", pytest.param("router", marks=thorough)])
 def place(request: pytest.FixtureRequest) -> Place:
     return Place(request.param)
 
@@ -150,7 +150,8 @@ def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_late_
     assert "lidar" not in latest.ask("facts")["x"]
 
 
-@pytest.mark.parametrize("seconds", [1.5, *(pytest.param(seconds, marks=thorough) for seconds in (7.0, 30.0))])
+@thorough
+@pytest.mark.parametrize("seconds", [1.5, 30.0])
 def test_a_frame_that_moves_once_while_a_peer_is_frozen_comes_to_it(
     seconds: float, processes: Crowd, place: Place
 ) -> None:
