@@ -51,6 +51,12 @@ EXTREMES = [0, 1, 2**7, 2**15, 2**16 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2*
 HEAD = struct.Struct("<BBBBHHIQ16sQQQ")
 
 
+@pytest.fixture
+def anyio_backend() -> tuple[str, dict[str, Any]]:
+    """One event loop: what a stranger says is judged before it."""
+    return "asyncio", {}
+
+
 class Scene(NamedTuple):
     """Facts that a stranger can learn, and its dice."""
 
@@ -442,7 +448,7 @@ def test_the_authorities_of_a_peer_have_so_many_letters_together() -> None:
     assert process.end.rejected == {"too many authorities": 200 - len(taken)}
 
 
-async def test_a_link_that_found_no_place_is_met_once_there_is_one() -> None:
+async def test_a_link_that_found_no_place_is_not_heard_and_is_met_once_there_is_one() -> None:
     network = MemoryNetwork()
     with Bus() as bus:
         async with DomainLink(bus, "d", network.wire()) as link:
@@ -451,6 +457,9 @@ async def test_a_link_that_found_no_place_is_met_once_there_is_one() -> None:
                 receive(f"{number:032x}", Joined(""))
             await until(lambda: len(link.peers) == MAX_PEERS and link.statistics().rejected["too many peers"] == 5)
             assert f"{MAX_PEERS:032x}" not in link.peers
+            receive(f"{MAX_PEERS:032x}", live(OutgoingBatch(BUS, 1, (static("map", "a"),))))
+            await until(lambda: link.statistics().queue.pending == 0)
+            assert statics(bus) == {}
             receive(f"{MAX_PEERS + 1:032x}", Left())
             receive(f"{7:032x}", Left())
             await until(lambda: f"{MAX_PEERS:032x}" in link.peers)
