@@ -1,8 +1,6 @@
 """`DomainLink` on an event loop, over a network in memory."""
 
 import asyncio
-import gc
-import logging
 import os
 from collections.abc import Callable, Sequence
 from itertools import count
@@ -209,30 +207,6 @@ async def test_a_bus_that_closes_while_the_wire_opens_is_not_linked_and_one_that
             assert link.statistics().rejected == {}
 
 
-async def test_a_link_that_nobody_enters_says_so() -> None:
-    gc.collect()
-    records: list[str] = []
-    handler = logging.Handler()
-    handler.emit = lambda record: records.append(record.getMessage())  # type: ignore[method-assign]
-    logger = logging.getLogger("tfbus")
-    filters, logger.filters = logger.filters, []
-    logger.addHandler(handler)
-    try:
-        DomainLink(Bus(), "tf", MemoryNetwork().wire())
-        gc.collect()
-        link = DomainLink(Bus(), "tf", MemoryNetwork().wire())
-        async with link:
-            pass
-        del link
-        gc.collect()
-    finally:
-        logger.removeHandler(handler)
-        logger.filters = filters
-    assert [record for record in records if "never entered" in record] == [
-        "a DomainLink was made and never entered, so it has done nothing: write `async with DomainLink(...)`"
-    ]
-
-
 def test_after_a_crash_of_the_event_loop_what_comes_does_no_harm_and_what_is_published_says_so(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -320,9 +294,9 @@ async def test_what_no_message_can_hold_is_counted_and_logged_and_the_rest_goes_
             # All together are too large for one message.
             long = "x" * 1_000
             here.publish([moving("map", f"{n}{long}", 1) for n in range(3)])
-            for n in range(6_000):
+            for n in range(3_000):
                 here.publish(static(f"{n}{long}", f"{n}{long}s"))
-            await until(lambda: there.statistics().frames == 6_004)
+            await until(lambda: there.statistics().frames == 3_004)
             assert link.statistics().not_sent == {"stamp": 2, "frame name": 3, "authority": 2}
     assert sum("not sent over the link tf" in message for message in caplog.messages) <= 6
 
