@@ -1,4 +1,4 @@
-"""How a router notices that another one is connected and does not tell it anything.
+"""The case in which a router is connected to another one and is told nothing by it.
 
 Connected zenoh routers tell each other once, when a connection begins, what their clients declare: subscribers and
 tokens. Two defects of zenoh 1.10 lose that, until the connection breaks again. In both, one router is told too little,
