@@ -10,6 +10,7 @@ from itertools import product
 from typing import Any
 
 import anyio
+import anyio.lowlevel
 import pytest
 import zenoh
 from hypothesis import given
@@ -209,6 +210,24 @@ async def test_all_links_leave_with_the_router_and_join_again_by_its_successor(
             await met(one, two)
             await talk(one, two)
         assert two.of(one)[:3] == [Joined(""), Left(), Joined("")]
+
+
+@pytest.mark.thorough
+async def test_a_session_that_breaks_while_its_link_publishes_is_closed(address: str, domain: str) -> None:
+    """A thread that fails would fail the test."""
+    async with listening(domain, connect=address) as one, anyio.create_task_group() as tasks:
+
+        async def publish() -> None:
+            while True:
+                one.wire.publish(LIVE, bytes(2**18))
+                await anyio.lowlevel.checkpoint()
+
+        tasks.start_soon(publish)
+        for _ in range(10):
+            async with ZenohRouter(address), listening(domain, connect=address) as two:
+                await met(one, two)
+            await until(lambda: not one.present)
+        tasks.cancel_scope.cancel()
 
 
 async def test_of_several_addresses_the_first_that_answers_is_taken(address: str, domain: str) -> None:
@@ -487,6 +506,7 @@ print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 async def test_a_program_may_exit_without_closing_its_wire(address: str, domain: str) -> None:
     program = f"""
 import anyio
+import anyio.lowlevel
 from tfbus.links.seams import Hearing
 from tfbus.links.zenoh.wire import ZenohWire
 async def main():

@@ -280,6 +280,8 @@ class _Session:
         self._link = link
         self._sender = bytes.fromhex(link)
         self._publishers: dict[str, tuple[zenoh.Publisher, float]] = {}
+        # zenoh refuses to undeclare a publisher by which the event loop is publishing.
+        self._publishing = threading.Lock()
         self._declared: list[object] = []
         self._neighbours: Neighbours | None = None
 
@@ -330,14 +332,15 @@ class _Session:
 
     def is_heard(self, channel: str) -> bool:
         try:
-            publisher, since = self._publishers.get(channel) or self.declare(channel)
-            return bool(publisher.matching_status.matching) or monotonic() < since + SETTLED  # type: ignore[attr-defined]
+            with self._publishing:
+                publisher, since = self._publishers.get(channel) or self.declare(channel)
+                return bool(publisher.matching_status.matching) or monotonic() < since + SETTLED  # type: ignore[attr-defined]
         except zenoh.ZError:
             # The session has just ended.
             return False
 
     def publish(self, channel: str, message: bytes) -> None:
-        with suppress(zenoh.ZError):
+        with suppress(zenoh.ZError), self._publishing:
             publisher, _ = self._publishers.get(channel) or self.declare(channel)
             publisher.put(message)
 
@@ -352,10 +355,11 @@ class _Session:
 
     def close(self) -> None:
         """Close the session; blocks."""
-        for publisher, _ in list(self._publishers.values()):
-            # Otherwise zenoh keeps 13 kB of each for ever.
-            with suppress(zenoh.ZError):
-                publisher.undeclare()
+        with self._publishing:
+            for publisher, _ in list(self._publishers.values()):
+                # Otherwise zenoh keeps 13 kB of each for ever.
+                with suppress(zenoh.ZError):
+                    publisher.undeclare()
         try:
             (self._neighbours or self._session).close()
         finally:
