@@ -506,7 +506,6 @@ print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 async def test_a_program_may_exit_without_closing_its_wire(address: str, domain: str) -> None:
     program = f"""
 import anyio
-import anyio.lowlevel
 from tfbus.links.seams import Hearing
 from tfbus.links.zenoh.wire import ZenohWire
 async def main():
