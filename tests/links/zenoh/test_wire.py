@@ -213,6 +213,7 @@ async def test_all_links_leave_with_the_router_and_join_again_by_its_successor(
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
 async def test_a_session_that_breaks_while_its_link_publishes_is_closed(address: str, domain: str) -> None:
     """A thread that fails would fail the test."""
     async with listening(domain, connect=address) as one, anyio.create_task_group() as tasks:
