@@ -32,12 +32,15 @@ many_frames = st.lists(st.tuples(st.sampled_from("xyz"), st.sampled_from("abc"),
 batches = st.lists(st.tuples(one_frame | many_frames, st.booleans(), st.sampled_from(["", "driver"])), max_size=5)
 
 
-def columns_of(rows: Rows) -> tuple[Any, Any, Any, Any, Any]:
-    """Parents, children, stamps, translations and rotations; a name or a stamp that all rows share stands once."""
+def columns_of(rows: Rows) -> dict[str, Any]:
+    """The columns by their names; a name or a stamp that all rows share stands once."""
     parents, children, stamps, moves = ([*column] for column in zip(*rows, strict=True)) if rows else ([], [], [], [])
     shared = [column[0] if len(set(column)) == 1 else column for column in (parents, children, stamps)]
-    translations = np.array([move.translation for move in moves]).reshape(-1, 3)
-    return *shared, translations, np.array([move.rotation for move in moves]).reshape(-1, 4)
+    return {
+        **dict(zip(("parents", "children", "stamps"), shared, strict=True)),
+        "translations": np.array([move.translation for move in moves]).reshape(-1, 3),
+        "rotations": np.array([move.rotation for move in moves]).reshape(-1, 4),
+    }
 
 
 def objects_of(rows: Rows, authority: str, static: bool) -> list[TransformStamped]:
@@ -57,7 +60,7 @@ def assert_same(*trees: TransformTree) -> None:
 def test_columns_in_a_tree_are_the_samples_in_a_batch(drawn: Any, keep: float | None) -> None:
     by_columns, by_objects = TransformTree(keep), TransformTree(keep)
     for rows, static, authority in drawn:
-        outcomes = by_columns.insert_columns(*columns_of(rows), authority, static=static)
+        outcomes = by_columns.insert_columns(**columns_of(rows), authority=authority, static=static)
         assert outcomes == by_objects.insert_many(objects_of(rows, authority, static))
     assert_same(by_columns, by_objects)
 
@@ -80,7 +83,7 @@ def test_columns_on_a_bus_are_the_samples_in_a_batch(listener: str, drawn: Any) 
                 buffer.watch("map", "a")
             for rows, static, authority in drawn:
                 if publish_columns:
-                    bus.publish_columns(*columns_of(rows), authority, static=static)
+                    bus.publish_columns(**columns_of(rows), authority=authority, static=static)
                 else:
                     bus.publish(objects_of(rows, authority, static))
             if listener == "events":
