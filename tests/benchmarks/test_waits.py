@@ -1,10 +1,11 @@
 """What waiting costs from the question to the answer, beside events and checkpoints of the same run.
 
 `test_speed.py` measures a wake-up alone. Here a task asks, is parked, is woken by a publish, and takes the answer; then
-it asks again. The times are of the processor; the turns of the loop and the publisher's checkpoints count on both sides.
+it asks again. The turns of the loop and the publisher's checkpoints count on both sides. Times are of the processor.
 """
 
 from collections.abc import AsyncIterator, Awaitable, Callable
+from itertools import pairwise
 from time import thread_time
 from typing import Any
 
@@ -76,7 +77,7 @@ def lookup_cycle(package: Any, edges: int, timeout: float | None) -> AsyncTurn:
         bus = package.Bus(max_behind=None)
         buffer = package.Buffer(bus)
         frames = [BASE, *(f"f{i}" for i in range(edges))]
-        for parent, child in zip(frames[:-2], frames[1:-1], strict=True):
+        for parent, child in pairwise(frames[:-1]):
             bus.publish(samples_of(package, child, CYCLES + 1, parent=parent))
         lagging = samples_of(package, frames[-1], CYCLES + 1, parent=frames[-2])
         bus.publish(lagging[0])
