@@ -1,8 +1,6 @@
 """`DomainLink` on an event loop, over a network in memory."""
 
 import asyncio
-import gc
-import logging
 import os
 from collections.abc import Callable, Sequence
 from itertools import count
@@ -209,30 +207,6 @@ async def test_a_bus_that_closes_while_the_wire_opens_is_not_linked_and_one_that
             assert link.statistics().rejected == {}
 
 
-async def test_a_link_that_nobody_enters_says_so() -> None:
-    gc.collect()
-    records: list[str] = []
-    handler = logging.Handler()
-    handler.emit = lambda record: records.append(record.getMessage())  # type: ignore[method-assign]
-    logger = logging.getLogger("tfbus")
-    filters, logger.filters = logger.filters, []
-    logger.addHandler(handler)
-    try:
-        DomainLink(Bus(), "tf", MemoryNetwork().wire())
-        gc.collect()
-        link = DomainLink(Bus(), "tf", MemoryNetwork().wire())
-        async with link:
-            pass
-        del link
-        gc.collect()
-    finally:
-        logger.removeHandler(handler)
-        logger.filters = filters
-    assert [record for record in records if "never entered" in record] == [
-        "a DomainLink was made and never entered, so it has done nothing: write `async with DomainLink(...)`"
-    ]
-
-
 async def test_a_bus_that_links_again_hears_and_says_nothing_twice() -> None:
     network = MemoryNetwork()
     with Bus() as bus, Bus() as other:
@@ -366,9 +340,9 @@ async def test_what_no_message_can_hold_is_counted_and_logged_and_the_rest_goes_
             # All together are too large for one message.
             long = "x" * 1_000
             here.publish([moving("map", f"{n}{long}", 1) for n in range(3)])
-            for n in range(6_000):
+            for n in range(3_000):
                 here.publish(static(f"{n}{long}", f"{n}{long}s"))
-            await until(lambda: there.statistics().frames == 6_004)
+            await until(lambda: there.statistics().frames == 3_004)
             assert link.statistics().not_sent == {"stamp": 2, "frame name": 3, "authority": 2}
     assert sum("not sent over the link tf" in message for message in caplog.messages) <= 6
 

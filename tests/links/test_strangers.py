@@ -13,7 +13,7 @@ from support.domains import Network, Stranger, World
 from support.samples import moving, static
 
 from tfbus import PeerLost, PeerRejected, TransformStamped
-from tfbus.links.endpoint import MAX_AUTHORITIES, MAX_PEERS
+from tfbus.links.endpoint import MAX_AUTHORITIES
 from tfbus.links.message import Kind, Outgoing, read_message, write_body, write_message, write_text
 from tfbus.links.relay import LARGEST_JUMP, OutgoingBatch, RemovedFrame
 from tfbus.links.replica import MANY_ORIGINS, Claim
@@ -304,22 +304,6 @@ def test_batches_with_too_many_authorities_of_a_peer_are_refused_and_counted() -
             told.append(event)
     (lost,) = [event for event in told if isinstance(event, PeerLost)]
     assert (lost.link, lost.peer, lost.frames, len(lost.authorities)) == ("tf", scene.stranger.id, ("a",), 1_000)
-
-
-def test_so_many_peers_are_there_and_the_messages_of_others_are_not_taken() -> None:
-    scene = Scene()
-    others = [Stranger(scene.network, channel="") for _ in range(MAX_PEERS)]
-    scene.world.run(0.1)
-    assert len(scene.process.end.present) == MAX_PEERS
-    assert scene.rejected == {"too many peers": 1}
-    others[-1].say(others[-1].batch(static("map", "a"), number=scene.first))
-    assert scene.frames == set()
-    scene.network.remove(others[0])
-    scene.network.remove(others[-1])
-    scene.network.add(others[-1])
-    scene.world.run(0.1)
-    others[-1].say(others[-1].batch(static("map", "a"), number=scene.first))
-    assert scene.frames == {"a"}
 
 
 def test_nothing_is_taken_of_a_link_that_was_not_announced_or_has_gone() -> None:

@@ -4,9 +4,9 @@ from pathlib import Path
 import anyio
 import pytest
 from support.processes import free_address, until
-from support.zenoh_wires import LIVE, listening, met, talk
+from support.zenoh_wires import LIVE, Ear, Way, listening, met, start_router, talk, way_to
 
-from tfbus.links.seams import Joined
+from tfbus.links.seams import Joined, Left
 from tfbus.links.zenoh.sessions import router_config
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
 
@@ -21,6 +21,49 @@ async def test_links_of_routers_that_find_each_other_late_hear_each_other(addres
             await met(one, two)
             await talk(one, two)
         await until(lambda: not one.present)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_routers_that_connect_to_each_other_tell_each_other_all_after_each_break(
+    address: str, domain: str
+) -> None:
+    other = free_address()
+    async with way_to(other) as way, way_to(address) as back:
+        with start_router(address, way.address), start_router(other, back.address):
+            async with listening(domain, connect=address) as one, listening(domain, connect=other) as two:
+                await hear_each_other_after_each_break(one, two, way, back)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_links_that_listen_and_connect_to_each_other_hear_each_other_after_each_break(
+    address: str, domain: str
+) -> None:
+    other = free_address()
+    async with (
+        way_to(other) as way,
+        way_to(address) as back,
+        listening(domain, listen=address, connect=way.address, lease=1.0) as one,
+        listening(domain, listen=other, connect=back.address, lease=1.0) as two,
+    ):
+        await hear_each_other_after_each_break(one, two, way, back)
+
+
+async def hear_each_other_after_each_break(one: Ear, two: Ear, way: Way, back: Way) -> None:
+    for _ in range(3):
+        await met(one, two)
+        await talk(one, two)
+        before = len(one.items), len(two.items)
+        await way.cut(far_only=True)
+        await back.cut()
+        await until(
+            lambda before=before: any(  # type: ignore[misc]
+                Left() in [item for _, item in ear.items[start:]] for ear, start in zip((one, two), before, strict=True)
+            )
+        )
+    await met(one, two)
+    await talk(one, two)
 
 
 async def test_a_router_listens_at_several_addresses(address: str, domain: str) -> None:

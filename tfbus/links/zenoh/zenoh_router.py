@@ -1,24 +1,37 @@
 """A zenoh router in this process, which links and other routers connect to."""
 
 import threading
+from time import monotonic
 from types import TracebackType
 from typing import Final, Self
 
 import anyio
 import anyio.to_thread
 
-from tfbus.links.zenoh.sessions import Addresses, Keeper, Settings, close_session, open_session, router_config
+from tfbus.links.zenoh.neighbours import Neighbours
+from tfbus.links.zenoh.sessions import (
+    Addresses,
+    Keeper,
+    Settings,
+    begin_to_close,
+    close_session,
+    open_session,
+    router_config,
+)
 from tfbus.registration import warn_unless_entered
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
 """The address of a router that is given none: only processes of this machine reach it."""
+PAUSE: Final = 0.05
+"""s between two attempts to listen again."""
 
 
 class ZenohRouter:
     """Passes on what links send each other: ``async with ZenohRouter("tcp/192.168.1.5:7447")``.
 
     It has no bus, knows no domains, and passes on only what a link behind it, or behind another router, has subscribed
-    to. Routers that are connected are as one; each link needs one of them.
+    to. Routers that are connected are as one; each link needs one of them. A router begins anew, and its links connect
+    again, if another one is connected and tells it nothing (see `tfbus.links.zenoh.neighbours`).
 
     Parameters
     ----------
@@ -80,13 +93,25 @@ class ZenohRouter:
         await self._keeper.end()
 
     def _keep(self) -> None:
-        try:
-            session = open_session(self._config)
-        except OSError as error:
-            self._failure = error
-            return
-        finally:
-            self._opened.set()
-        while not self._keeper.stopped:
-            self._keeper.changed.wait()
-        close_session(session)
+        """Have one session after another, until the router is closed; the first one has to open."""
+        keeper = self._keeper
+        while not (self._opened.is_set() and keeper.stopped):
+            try:
+                router = Neighbours(open_session(self._config), keeper.changed.set)
+            except OSError as error:
+                if not self._opened.is_set():
+                    self._failure = error
+                    return
+                # The session before may not have freed the address yet.
+                keeper.changed.wait(PAUSE)
+                keeper.changed.clear()
+                continue
+            finally:
+                self._opened.set()
+            while not (keeper.stopped or router.are_silent(monotonic())):
+                keeper.changed.wait(router.period)
+                keeper.changed.clear()
+            if keeper.stopped:
+                close_session(router)
+            else:
+                begin_to_close(router)
