@@ -42,7 +42,6 @@ from tfbus.tf_message import MalformedMessageError
 
 SIGN_PERIOD = 1.0
 SIGN_PERIOD_EACH = 0.05
-LONGEST_SIGN_PERIOD = 2.0
 LONGEST_SIGN_PERIOD_EACH = 0.1
 """s; a link signs so long after it has sent something or met a peer, and then after twice that time, up to the longest.
 
@@ -166,7 +165,7 @@ class DomainEnd(Endpoint):
             due = self._agreement.next_due()
         if now >= self._sign_due:
             peers = len(self.present)
-            self._sign_period = min(2 * self._sign_period, max(LONGEST_SIGN_PERIOD, LONGEST_SIGN_PERIOD_EACH * peers))
+            self._sign_period = min(2 * self._sign_period, max(self._wire.rest, LONGEST_SIGN_PERIOD_EACH * peers))
             self._sign(now)
         due = min(due, self._sign_due, self._answers_due if self._questions else inf)
         if self._history is not None:
