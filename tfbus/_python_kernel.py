@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.rows import IDENTITY, Row, compose, invert
+from tfbus.rows import IDENTITY, Row, Vector, compose, invert, rotate
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps
 
 SampleT = TypeVar("SampleT", bound="Sample")
@@ -234,6 +234,94 @@ def compose_paths(rows: npt.NDArray[np.float64], origins: npt.NDArray[np.int64])
     rows[:] = composed
 
 
+compose_rows = compose
+invert_row = invert
+
+
+def move_point(row: Row, point: Any) -> Vector | None:
+    """A point, as a tuple of three numbers, moved by a transform; None if it is not plain.
+
+    It is plain as a tuple of ``float`` and ``int``, because numbers of numpy have their own arithmetic.
+    """
+    if type(point) is not tuple or len(point) != 3 or not {*map(type, point)} <= {float, int}:
+        return None
+    try:
+        x, y, z = map(float, point)
+    except OverflowError:
+        return None
+    rx, ry, rz = rotate(row[3:], x, y, z)
+    return row[0] + rx, row[1] + ry, row[2] + rz
+
+
+def fill_matrix(row: Row, out: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Write the homogeneous matrix of a row into an array of shape (4, 4), and return it: transforms3d's `quat2mat`."""
+    tx, ty, tz, x, y, z, w = row
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    sx, sy, sz = x * s, y * s, z * s
+    wx, wy, wz, xx, xy, xz = w * sx, w * sy, w * sz, x * sx, x * sy, x * sz
+    yy, yz, zz = y * sy, y * sz, z * sz
+    out[:] = (
+        (1.0 - (yy + zz), xy - wz, xz + wy, tx),
+        (xy + wz, 1.0 - (xx + zz), yz - wx, ty),
+        (xz - wy, yz + wx, 1.0 - (xx + yy), tz),
+        (0.0, 0.0, 0.0, 1.0),
+    )
+    return out
+
+
+def move_points(row: Row, points: npt.NDArray[Any], out: npt.NDArray[Any]) -> bool:
+    """Move points of shape (..., 3), which are contiguous and of the same float type as `out`.
+
+    Returns
+    -------
+    bool
+        Whether they were plain; here, they all are. The compiled kernel takes float64 and float32.
+    """
+    matrix = fill_matrix(row, np.empty((4, 4))).astype(out.dtype)
+    x, y, z = np.moveaxis(points, -1, 0)
+    with np.errstate(all="ignore"):
+        for column, (mx, my, mz, shift) in enumerate(matrix[:3]):
+            out[..., column] = x * mx + y * my + z * mz + shift
+    return True
+
+
+_NEARLY_RIGID = 1e-14
+
+
+def row_of_matrix(matrix: npt.NDArray[np.float64]) -> Row | None:
+    """The row of a contiguous homogeneous matrix, with qw >= 0; None if it is not finite and rigid but for rounding.
+
+    Read as by Shepperd, "Quaternion from rotation matrix", 1978: the part of the quaternion with the greatest square
+    comes first.
+    """
+    if matrix.shape != (4, 4) or not matrix.flags.c_contiguous:
+        return None
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = rows = matrix.tolist()
+    if last != [0.0, 0.0, 0.0, 1.0] or (x + y + z) * 0.0 != 0.0:
+        return None
+    for k in range(3):
+        for n in range(k, 3):
+            one, other = rows[k], rows[n]
+            off = one[0] * other[0] + one[1] * other[1] + one[2] * other[2] - (1.0 if k == n else 0.0)
+            if not -_NEARLY_RIGID <= off <= _NEARLY_RIGID:
+                return None
+    if not a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0:
+        return None
+    squares = 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i, 1.0 + a + e + i
+    first = max(3, 0, 1, 2, key=squares.__getitem__)
+    xy, xz, yz, xw, yw, zw = d + b, g + c, h + f, h - f, c - g, d - b
+    products = (
+        (squares[0], xy, xz, xw),
+        (xy, squares[1], yz, yw),
+        (xz, yz, squares[2], zw),
+        (xw, yw, zw, squares[3]),
+    )
+    i, j, k, w = products[first]
+    length = sqrt(i * i + j * j + k * k + w * w)
+    scale = -length if w < 0.0 else length
+    return x, y, z, i / scale, j / scale, k / scale, w / scale
+
+
 _RECORD = struct.Struct("q7d")
 _SIZE = _RECORD.size
 _FOREVER = 2**64
@@ -261,6 +349,8 @@ class History:
         Of the newest sample.
     mixed : bool
         Whether the samples name several parents. Then no answer is plain.
+    static_stamp : int or None
+        The stamp of the sample that holds at every stamp, in ns; None if there is none.
     horizon : int
         Samples with a stamp before this one, in ns, have left the window.
     stamps : array of int
@@ -268,12 +358,13 @@ class History:
         Samples that have left the window stay until the next cut.
     """
 
-    __slots__ = ("_cut_after", "_keep", "authority", "horizon", "mixed", "parent", "records", "stamps")
+    __slots__ = ("_cut_after", "_keep", "authority", "horizon", "mixed", "parent", "records", "stamps", "static_stamp")
 
     def __init__(self, parent: str, keep: int | None) -> None:
         self.parent = parent
         self.authority = ""
         self.mixed = False
+        self.static_stamp: int | None = None
         self.stamps = array("q")
         self.records = bytearray()
         self.horizon = STAMP_MIN
@@ -549,13 +640,23 @@ class Chain:
     ----------
     up, down : tuple of steps
         From source, and from target, to their common ancestor: moving edges, and one row for each run of static edges.
+    alone : bool
+        Whether no other way between the two frames counts at any stamp. Who makes the chain knows it.
+
+    Parameters
+    ----------
+    up, down
+    statics : tuple of History
+        The static edges.
     """
 
-    __slots__ = ("_edges", "down", "up")
+    __slots__ = ("_edges", "_statics", "alone", "down", "up")
 
-    def __init__(self, up: tuple[Step, ...], down: tuple[Step, ...]) -> None:
+    def __init__(self, up: tuple[Step, ...], down: tuple[Step, ...], statics: tuple[History, ...]) -> None:
         self.up = up
         self.down = down
+        self._statics = statics
+        self.alone = False
         self._edges = tuple(step for step in (*up, *down) if isinstance(step, History))
 
     def row(self, at: int) -> Row | None:
@@ -567,14 +668,38 @@ class Chain:
         return None if down is None else compose(invert(down), up)
 
     def latest(self) -> int | None:
-        """The newest stamp that all edges have reached, in ns; None if one has no samples, or nothing moves."""
+        """The stamp that `LATEST` means, in ns; None if a moving edge has no samples, or there is no edge.
+
+        It is the newest one that all moving edges have reached; if nothing moves, the newest of the static samples.
+        """
+        if not self._edges:
+            return max((edge.static_stamp or 0 for edge in self._statics), default=None)
         common = STAMP_MAX
         for edge in self._edges:
             if not edge.stamps:
                 return None
             if edge.stamps[-1] < common:
                 common = edge.stamps[-1]
-        return common if self._edges else None
+        return common
+
+    def covers(self, at: int) -> bool:
+        """Whether the samples of every moving edge cover a stamp."""
+        return all(edge.stamps and edge.stamps[edge._start] <= at <= edge.stamps[-1] for edge in self._edges)
+
+    def deciding(self, at: int) -> History | None:
+        """The edge whose error counts at a stamp that is not covered; None if nothing moves.
+
+        It is the first edge that has dropped the stamp, else the one that lags most.
+        """
+        lagging, reached = (self._edges[0] if self._edges else None), STAMP_MAX
+        for edge in self._edges:
+            oldest, newest = edge.oldest, edge.newest
+            if oldest is not None and newest is not None and newest >= at:
+                if oldest > at:
+                    return edge
+            elif (came_to := STAMP_MIN if newest is None else newest) < reached:
+                lagging, reached = edge, came_to
+        return lagging
 
     def hold(self) -> Any:
         """The present samples of all edges, for answers at many stamps. Here None: numpy reads copies."""
@@ -600,9 +725,11 @@ class Paths:
         Number of samples at new stamps.
     version : int
         A number that differs after each change.
+    now : callable or None
+        The clock that ages are counted from, which gives a stamp in ns. Only the compiled kernel asks it.
     """
 
-    __slots__ = ("_changes", "_kind", "_latest", "_lock", "inserted", "recent")
+    __slots__ = ("_changes", "_kind", "_latest", "_lock", "inserted", "now", "recent")
 
     def __init__(self, lock: AbstractContextManager[Any], latest: Latest, kind: Any) -> None:
         self._lock = lock
@@ -610,6 +737,7 @@ class Paths:
         self._kind = kind
         self.recent: dict[str, dict[str, Chain]] = {}
         self.inserted = 0
+        self.now: Any = None
         self._changes = 0
 
     @property
@@ -626,18 +754,33 @@ class Paths:
         with self._lock:
             by_source = self.recent.get(target)
             chain = None if by_source is None else by_source.get(source)
-            if chain is None or not chain._edges:
+            if chain is None or not (chain.up or chain.down):
                 return None
             stamp = chain.latest() if at is self._latest else at
-            if type(stamp) is not int:
+            if type(stamp) is not int or not (chain._edges or STAMP_MIN <= stamp <= STAMP_MAX):
                 return None
             row = chain.row(stamp) if chain.down else climb(chain.up, stamp)
             if row is None:
                 return None
         kind = self._kind
         sample = kind.__new__(kind)
-        sample._fields = target, source, stamp, row, "", False
+        sample._fields = target, source, stamp, row, "", not chain._edges
         return sample
+
+    def can_answer(self, target: str, source: str, at: object) -> bool | None:
+        """Whether a lookup has an answer, if a path of `recent` tells; else None."""
+        with self._lock:
+            by_source = self.recent.get(target)
+            chain = None if by_source is None else by_source.get(source)
+            if chain is None or not (chain.up or chain.down):
+                return None
+            stamp = chain.latest() if at is self._latest else at
+            if stamp is None and at is not None:
+                return False
+            if type(stamp) is not int or not STAMP_MIN <= stamp <= STAMP_MAX:
+                return None
+            covered = chain.covers(stamp)
+            return covered if covered or chain.alone else None
 
     def commit(self, frames: Mapping[str, History], readers: Mapping[int, Any], batch: Sequence[Sample]) -> bool:
         """Store a batch if all of it continues its histories and there are no readers to notify; else do nothing.

@@ -77,6 +77,13 @@ def _restore(
     return error
 
 
+def error_of(kind: type[AnyError], facts: dict[str, Any]) -> AnyError:
+    """An error that consists of its facts, such as ``kind(**facts)`` gives it, in half the time; nothing is checked."""
+    error = kind.__new__(kind)
+    error.__dict__ = facts
+    return error
+
+
 class TransformError(Exception):
     """Base class of all tfbus errors. The text is one line: control characters in names are escaped in it."""
 

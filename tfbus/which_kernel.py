@@ -57,7 +57,13 @@ if kernel == "python":
         columns,
         commit,
         compose_paths,
+        compose_rows,
         decode,
+        fill_matrix,
+        invert_row,
+        move_point,
+        move_points,
+        row_of_matrix,
     )
 
     Feed: Any = None
@@ -77,7 +83,13 @@ else:
         columns,
         commit,
         compose_paths,
+        compose_rows,
         decode,
+        fill_matrix,
+        invert_row,
+        move_point,
+        move_points,
+        row_of_matrix,
     )
 
 __all__ = [
@@ -94,9 +106,15 @@ __all__ = [
     "columns",
     "commit",
     "compose_paths",
+    "compose_rows",
     "decode",
+    "fill_matrix",
+    "invert_row",
     "kernel",
+    "move_point",
+    "move_points",
     "plain_first",
+    "row_of_matrix",
 ]
 
 

@@ -21,8 +21,9 @@ from hypothesis import strategies as st
 from support.both_kernels import COMPILED, KERNELS, bits, needs_both, sample_class
 from support.samples import row_of
 from support.strategies import TODAY, transforms
+from transforms3d.quaternions import quat2mat
 
-from tfbus import LATEST, SECOND, Hold, Transform, TransformStamped, TransformTree
+from tfbus import LATEST, SECOND, Hold, Transform, TransformStamped, TransformTree, _python_kernel
 from tfbus.rows import IDENTITY, Row, compose, interpolate, invert
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
@@ -208,7 +209,7 @@ def drawn_chains(draw: st.DrawFn) -> Drawn:
 
 def chain(kernel: Any, up: list[Poses | Row], down: list[Poses | Row]) -> Any:
     sides = [tuple(history(kernel, step) if isinstance(step, list) else step for step in side) for side in (up, down)]
-    return kernel.Chain(*sides)
+    return kernel.Chain(*sides, ())
 
 
 def expected_row(up: list[Poses | Row], down: list[Poses | Row], at: int) -> Row | None:
@@ -239,6 +240,42 @@ def test_the_row_of_a_chain_is_bit_for_bit_the_product_of_its_interpolated_edges
     if row is None and kernel is COMPILED and widest_gap(up + down) > 2**53:
         return
     assert bits(row) == bits(expected_row(up, down, at))
+
+
+@on_both
+@given(drawn_chains(), st.booleans())
+def test_a_chain_says_which_stamps_it_covers_and_which_edge_decides(kernel: Any, drawn: Drawn, alone: bool) -> None:
+    at, up, down = drawn
+    asked = chain(kernel, up, down)
+    asked.alone = alone
+    edges = [step for step in (*asked.up, *asked.down) if isinstance(step, kernel.History)]
+    covered = [bool(edge.count) and edge.oldest <= at <= edge.newest for edge in edges]
+    assert asked.covers(at) == all(covered)
+    known = paths(kernel, cart=asked)
+    if up or down:
+        assert known.can_answer("map", "cart", at) is (True if all(covered) else False if alone else None)
+    assert known.can_answer("map", "cart", 2**70) is known.can_answer("map", "chair", at) is None
+    assert known.can_answer("map", "cart", 0.5) is None
+    if not all(covered):
+        dropped = [edge for edge in edges if edge.count and edge.oldest > at]
+        lagging = sorted(edges, key=lambda edge: STAMP_MIN if edge.newest is None else edge.newest)
+        assert asked.deciding(at) is (dropped or lagging)[0]
+
+
+@on_both
+def test_the_latest_of_static_edges_is_their_newest_stamp(kernel: Any) -> None:
+    edges = [history(kernel), history(kernel)]
+    static = kernel.Chain((x(1.0),), (x(3.0),), tuple(edges))
+    known = paths(kernel, cart=static)
+    for stamps, newest in (((-5, None), 0), ((-5, -7), -5), ((TODAY, 7), TODAY)):
+        for edge, stamp in zip(edges, stamps, strict=True):
+            edge.static_stamp = stamp
+        assert static.latest() == newest
+        found = known.answer("map", "cart", LATEST)
+        assert (found.stamp, found.static, found._row[0]) == (newest, True, -2.0)
+    assert known.answer("map", "cart", STAMP_MAX).static
+    assert known.answer("map", "cart", STAMP_MAX + 1) is None
+    assert paths(kernel, cart=kernel.Chain((), (), ())).answer("map", "cart", LATEST) is None
 
 
 @needs_both
@@ -386,7 +423,7 @@ def test_the_garbage_collector_finds_a_cycle_through_paths_and_chains(kernel: Mo
         pass
 
     edge = Edge("parent", None)
-    edge.paths = paths(kernel, cart=kernel.Chain((edge,), ()))
+    edge.paths = paths(kernel, cart=kernel.Chain((edge,), (), ()))
     gone = weakref.ref(edge)
     del edge
     gc.collect()
@@ -397,7 +434,7 @@ def test_the_garbage_collector_finds_a_cycle_through_paths_and_chains(kernel: Mo
 def test_wrong_arguments_raise_and_never_crash() -> None:
     kernel: Any = COMPILED
     edge = history(kernel, [(0, x(0.0))])
-    path = kernel.Chain((edge,), ())
+    path = kernel.Chain((edge,), (), ())
     for call in (
         lambda: kernel.History(),
         lambda: kernel.History(5, None),
@@ -421,8 +458,8 @@ def test_wrong_arguments_raise_and_never_crash() -> None:
         lambda: edge.columns(0),
         lambda: setattr(edge, "parent", 5),
         lambda: delattr(edge, "authority"),
-        lambda: kernel.Chain((), 5),
-        lambda: kernel.Chain((5,), ()),
+        lambda: kernel.Chain((), 5, ()),
+        lambda: kernel.Chain((5,), (), ()),
         lambda: path.row("x"),
         lambda: path.hold().rows(np.zeros(2, np.int64), np.zeros(13)),
         lambda: path.hold().rows(np.zeros(2, np.int64), bytes(112)),
@@ -432,13 +469,21 @@ def test_wrong_arguments_raise_and_never_crash() -> None:
         lambda: kernel.compose_paths(np.zeros((2, 7)), np.zeros(3, np.int64)),
         lambda: kernel.Paths(5, LATEST, kernel.Sample),
         lambda: kernel.Paths(threading.Lock(), LATEST, int),
-        lambda: path.__init__((), ()),
+        lambda: path.__init__((), (), ()),
+        lambda: kernel.Chain((), (), (5,)),
         lambda: paths(kernel).answer("map"),
         lambda: paths(kernel).answer_many("map", "cart"),
         lambda: setattr(paths(kernel), "recent", []),
         lambda: kernel.commit({}, [], 0),
         lambda: kernel.commit({}, (), "0"),
         lambda: kernel.Block(),
+        lambda: kernel.compose_rows(IDENTITY),
+        lambda: kernel.compose_rows(IDENTITY, (1.0,)),
+        lambda: kernel.invert_row(5),
+        lambda: kernel.move_point((), (1.0, 2.0, 3.0)),
+        lambda: kernel.fill_matrix(IDENTITY, np.empty(7)),
+        lambda: kernel.fill_matrix(IDENTITY, bytes(128)),
+        lambda: kernel.move_points(IDENTITY),
     ):
         with pytest.raises((TypeError, ValueError, IndexError, AttributeError, BufferError, RuntimeError)):
             call()
@@ -470,6 +515,52 @@ def test_composed_paths_are_bit_for_bit_the_products_of_their_rows(kernel: Any, 
 def test_an_origin_comes_before_its_row(kernel: Any, origins: list[int]) -> None:
     with pytest.raises(ValueError, match="needs an origin before it"):
         kernel.compose_paths(np.zeros((2, 7)), np.array(origins))
+
+
+@on_both
+@given(transforms(), transforms(), st.booleans())
+def test_the_arithmetic_of_transforms_has_the_bits_of_its_readable_definition(
+    kernel: Any, a: Transform, b: Transform, single: bool
+) -> None:
+    first, second = row_of(a), row_of(b)
+    assert bits(kernel.compose_rows(first, second)) == bits(compose(first, second))
+    assert bits(kernel.invert_row(first)) == bits(invert(first))
+    assert kernel.move_point(first, b.translation) == compose(first, second)[:3]
+    matrix = kernel.fill_matrix(first, np.empty((4, 4)))
+    assert np.array_equal(matrix[:3, :3], quat2mat(a.as_wxyz()))
+    assert np.array_equal(matrix[:, 3], (*a.translation, 1.0))
+    points = np.array([b.translation, (math.inf, 0.0, 1.0), (1, 2, math.nan)], np.float32 if single else np.float64)
+    moved = np.empty_like(points)
+    assert kernel.move_points(first, points, moved)
+    x, y, z = points.T
+    with np.errstate(invalid="ignore"):
+        columns = [x * row[0] + y * row[1] + z * row[2] + row[3] for row in matrix[:3].astype(points.dtype)]
+    assert np.array_equal(moved, np.stack(columns, 1), equal_nan=True)
+
+
+@on_both
+@given(transforms())
+def test_a_rigid_matrix_is_read_as_its_quaternion(kernel: Any, transform: Transform) -> None:
+    matrix = transform.matrix()
+    row = kernel.row_of_matrix(matrix)
+    assert row is not None
+    assert row[:3] == transform.translation
+    assert row[6] >= 0.0
+    assert bits(row) == bits(_python_kernel.row_of_matrix(matrix))
+    assert abs(row[3:] @ np.array(transform.rotation)) == pytest.approx(1.0, abs=1e-15)
+    for place, value in (((0, 0), 2.0), ((1, 2), math.nan), ((0, 3), math.inf), ((3, 3), 1.1)):
+        wrong = matrix.copy()
+        wrong[place] = value
+        assert kernel.row_of_matrix(wrong) is None
+    assert kernel.row_of_matrix(matrix * (1.0, 1.0, -1.0, 1.0)) is None
+
+
+@on_both
+@pytest.mark.parametrize(
+    "point", [(1.0, 2.0), (1.0, 2.0, np.float64(3.0)), (1, 2, 10**400), (1, 2, True), None], ids=str
+)
+def test_what_is_no_plain_point_is_handed_back(kernel: Any, point: Any) -> None:
+    assert kernel.move_point(IDENTITY, point) is None
 
 
 def known_edges(kernel: Any) -> dict[str, Any]:

@@ -88,9 +88,12 @@ def test_only_frames_of_a_loop_are_marked_as_in_it(parents: dict[str, str]) -> N
         assert above == frame
 
 
-def test_a_chain_of_two_thousand_frames_is_drawn_without_recursion() -> None:
-    picture = describe([edge(f"{depth:05}", f"{depth + 1:05}") for depth in range(2_000)])
-    assert picture.count("\n") == 2_000
+def test_a_chain_of_two_thousand_frames_is_drawn_without_recursion_and_with_a_bounded_indent() -> None:
+    lines = describe([edge(f"{depth:05}", f"{depth + 1:05}") for depth in range(2_000)]).splitlines()
+    assert len(lines) == 2_001
+    assert lines[64].startswith("    " * 63 + "└── 00064")
+    assert lines[70].startswith("…   " + "    " * 62 + "└── 00070")
+    assert lines[2_000].startswith("…   " + "    " * 62 + "└── 02000")
 
 
 # Graphviz

@@ -13,6 +13,7 @@
  * so everything is static and the compiler sees all of it at once.
  */
 #include "base.h"
+#include "transform.h"
 #include "samples.h"
 #include "paths.h"
 #include "waiting.h"
@@ -21,6 +22,16 @@
 /* The module -------------------------------------------------------------------------------------------------------- */
 
 static PyMethodDef module_methods[] = {
+    {"compose_rows", FAST(compose_rows), METH_FASTCALL, PyDoc_STR("compose_rows(a, b): the row of a @ b.")},
+    {"invert_row", (PyCFunction)invert_row, METH_O, PyDoc_STR("invert_row(row): the row of the inverse.")},
+    {"move_point", FAST(move_point), METH_FASTCALL,
+     PyDoc_STR("move_point(row, point): the moved point; None if it is not a tuple of three floats or int.")},
+    {"move_points", FAST(move_points), METH_FASTCALL,
+     PyDoc_STR("move_points(row, points, out): move contiguous points of float64 or float32; else False.")},
+    {"fill_matrix", FAST(fill_matrix), METH_FASTCALL,
+     PyDoc_STR("fill_matrix(row, out): write the homogeneous matrix of a row into an array, and return the array.")},
+    {"row_of_matrix", (PyCFunction)row_of_matrix, METH_O,
+     PyDoc_STR("row_of_matrix(matrix): the row of a homogeneous matrix; None if it is not rigid but for rounding.")},
     {"compose_paths", FAST(compose_paths), METH_FASTCALL,
      PyDoc_STR("compose_paths(rows, origins): make every pose relative to the first one.")},
     {"decode", FAST(decode), METH_FASTCALL,
@@ -56,7 +67,9 @@ module_exec(PyObject *module)
         const char *text;
         PyObject **place;
     } strings[] = {{"", &empty_string}, {"raise", &raise_string}, {"drop", &drop_string},
-                   {"at", &at_string}, {"_paths", &paths_string}, {"_memory", &memory_string}};
+                   {"at", &at_string}, {"_paths", &paths_string}, {"_memory", &memory_string},
+                   {"source_at", &source_at_string}, {"fixed", &fixed_string}, {"max_age", &max_age_string},
+                   {"not_before", &not_before_string}, {"not_after", &not_after_string}};
     for (size_t i = 0; i < sizeof strings / sizeof *strings; i++) {
         if (*strings[i].place == NULL && (*strings[i].place = PyUnicode_InternFromString(strings[i].text)) == NULL) {
             return -1;

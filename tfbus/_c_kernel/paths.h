@@ -22,9 +22,11 @@ typedef struct {
 typedef struct {
     PyObject_HEAD
     PyObject *sides[2];   /* the steps from the source up and from the target up, as tuples, which own the edges */
+    PyObject *statics;    /* the static edges, a tuple */
     Step *steps;          /* the same in a row */
     Py_ssize_t up, down;  /* the number of each */
     Py_ssize_t moving;    /* how many are edges */
+    char alone;           /* whether no other way between the two frames counts at any stamp */
 } Chain;
 
 static int
@@ -36,16 +38,24 @@ chain_clear(Chain *self)
     PyMem_Free(steps);
     Py_CLEAR(self->sides[0]);
     Py_CLEAR(self->sides[1]);
+    Py_CLEAR(self->statics);
     return 0;
 }
 
 static int
 chain_init(Chain *self, PyObject *args, PyObject *kwargs)
 {
-    PyObject *sides[2];
+    PyObject *sides[2], *statics;
     if (!has_no_keywords(kwargs)
-        || !PyArg_ParseTuple(args, "O!O!:Chain", &PyTuple_Type, &sides[0], &PyTuple_Type, &sides[1])) {
+        || !PyArg_ParseTuple(args, "O!O!O!:Chain", &PyTuple_Type, &sides[0], &PyTuple_Type, &sides[1], &PyTuple_Type,
+                             &statics)) {
         return -1;
+    }
+    for (Py_ssize_t i = 0; i < PyTuple_Size(statics); i++) {
+        if (!PyObject_TypeCheck(PyTuple_GetItem(statics, i), HistoryType)) {
+            PyErr_SetString(PyExc_TypeError, "static edges are histories");
+            return -1;
+        }
     }
     const Py_ssize_t up = PyTuple_Size(sides[0]), down = PyTuple_Size(sides[1]);
     Step *steps = PyMem_Calloc((size_t)(up + down + 1), sizeof(Step));
@@ -72,8 +82,10 @@ chain_init(Chain *self, PyObject *args, PyObject *kwargs)
     }
     Py_INCREF(sides[0]);
     Py_INCREF(sides[1]);
+    Py_INCREF(statics);
     self->sides[0] = sides[0];
     self->sides[1] = sides[1];
+    self->statics = statics;
     self->steps = steps;
     self->up = up;
     self->down = down;
@@ -133,11 +145,34 @@ chain_at(const Chain *self, int64_t at, double *out)
     return ANSWERED;
 }
 
-/* Whether every edge has samples and something moves; then `stamp` is the newest one that all have reached. */
+/* Whether there are static edges; then `stamp` is the newest of their stamps. Not inlined, because few chains need it. */
+Py_NO_INLINE static int
+chain_newest_static(const Chain *self, int64_t *stamp)
+{
+    const Py_ssize_t count = self->statics == NULL ? 0 : PyTuple_Size(self->statics);
+    int64_t newest = INT64_MIN;
+    for (Py_ssize_t i = 0; i < count; i++) {
+        PyObject *known = ((History *)PyTuple_GetItem(self->statics, i))->static_stamp;
+        int overflow = 0;
+        const int64_t own = known != NULL && PyLong_Check(known) ? PyLong_AsLongLongAndOverflow(known, &overflow) : 0;
+        if (overflow) {
+            return 0;
+        }
+        newest = own > newest ? own : newest;
+    }
+    *stamp = newest;
+    return count > 0;
+}
+
+/* Whether there is a stamp that `LATEST` means: the newest one that all moving edges have reached; if nothing moves, the
+ * newest of the static samples. */
 static int
 chain_newest(const Chain *self, int64_t *stamp)
 {
     int64_t common = INT64_MAX;
+    if (self->moving == 0) {
+        return chain_newest_static(self, stamp);
+    }
     for (Py_ssize_t i = 0; i < self->up + self->down; i++) {
         const History *edge = self->steps[i].edge;
         if (edge == NULL) {
@@ -152,7 +187,63 @@ chain_newest(const Chain *self, int64_t *stamp)
         }
     }
     *stamp = common;
-    return self->moving > 0;
+    return 1;
+}
+
+/* Whether the samples of every moving edge cover a stamp. */
+static int
+chain_covers(const Chain *self, int64_t at)
+{
+    for (Py_ssize_t i = 0; i < self->up + self->down; i++) {
+        const History *edge = self->steps[i].edge;
+        if (edge == NULL) {
+            continue;
+        }
+        const Samples samples = samples_of(edge);
+        if (samples.count == 0 || at < samples.stamps[0] || at > samples.stamps[samples.count - 1]) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+static PyObject *
+chain_covers_method(Chain *self, PyObject *number)
+{
+    int64_t at;
+    return read_stamp(number, &at) < 0 ? NULL : PyBool_FromLong(chain_covers(self, at));
+}
+
+/* deciding(at): the edge whose error counts at a stamp that is not covered: the first that has dropped it, else the one
+ * that lags most. */
+static PyObject *
+chain_deciding(Chain *self, PyObject *number)
+{
+    int64_t at, reached = INT64_MAX;
+    if (read_stamp(number, &at) < 0) {
+        return NULL;
+    }
+    PyObject *lagging = Py_None;
+    for (Py_ssize_t i = 0; i < self->up + self->down; i++) {
+        History *edge = self->steps[i].edge;
+        if (edge == NULL) {
+            continue;
+        }
+        lagging = lagging == Py_None ? OBJECT(edge) : lagging;
+        const Samples samples = samples_of(edge);
+        const int64_t newest = samples.count == 0 ? INT64_MIN : samples.stamps[samples.count - 1];
+        if (samples.count > 0 && newest >= at) {
+            if (samples.stamps[0] > at) {
+                lagging = OBJECT(edge);
+                break;
+            }
+        } else if (newest < reached) {
+            lagging = OBJECT(edge);
+            reached = newest;
+        }
+    }
+    Py_INCREF(lagging);
+    return lagging;
 }
 
 static PyObject *
@@ -477,6 +568,7 @@ chain_traverse(Chain *self, visitproc visit, void *arg)
     Py_VISIT(Py_TYPE(OBJECT(self)));
     Py_VISIT(self->sides[0]);
     Py_VISIT(self->sides[1]);
+    Py_VISIT(self->statics);
     return 0;
 }
 
@@ -491,7 +583,11 @@ chain_dealloc(Chain *self)
 static PyMethodDef chain_methods[] = {
     {"row", (PyCFunction)chain_row, METH_O, PyDoc_STR("row(at): source in target at a stamp; None if it is not plain.")},
     {"latest", (PyCFunction)chain_latest, METH_NOARGS,
-     PyDoc_STR("The newest stamp that all edges have reached; None if one has no samples, or nothing moves.")},
+     PyDoc_STR("The stamp that LATEST means: the newest that all moving edges have reached, or the newest static one.")},
+    {"covers", (PyCFunction)chain_covers_method, METH_O,
+     PyDoc_STR("covers(at): whether the samples of every moving edge cover a stamp.")},
+    {"deciding", (PyCFunction)chain_deciding, METH_O,
+     PyDoc_STR("deciding(at): the edge whose error counts at a stamp that is not covered; None if nothing moves.")},
     {"hold", (PyCFunction)chain_hold, METH_NOARGS,
      PyDoc_STR("The present samples of all edges, for many answers; None if they are not plain.")},
     {NULL}
@@ -500,6 +596,8 @@ static PyMethodDef chain_methods[] = {
 static PyMemberDef chain_members[] = {
     {"up", T_OBJECT_EX, offsetof(Chain, sides[0]), READONLY, PyDoc_STR("The steps from the source up.")},
     {"down", T_OBJECT_EX, offsetof(Chain, sides[1]), READONLY, PyDoc_STR("The steps from the target up.")},
+    {"alone", T_BOOL, offsetof(Chain, alone), 0,
+     PyDoc_STR("Whether no other way between the two frames counts at any stamp.")},
     {NULL}
 };
 
@@ -527,6 +625,7 @@ typedef struct {
     PyObject *lock_is_held;  /* the method of the tree's lock that says so */
     PyObject *latest;        /* the sentinel */
     PyObject *kind;          /* the class of an answer, made of Sample */
+    PyObject *now;           /* the clock that ages are counted from, called for a stamp; None or NULL if there is none */
     long long inserted;      /* samples at new stamps */
     long long version;       /* another one after each change */
 } Paths;
@@ -544,7 +643,7 @@ paths_are_free(const Paths *self)
     return held == Py_False;
 }
 
-REFERENCES(paths, 4)
+REFERENCES(paths, 5)
 
 static int
 paths_init(Paths *self, PyObject *args, PyObject *kwargs)
@@ -587,6 +686,26 @@ paths_find(const Paths *self, PyObject *target, PyObject *source)
     return chain != NULL && PyObject_TypeCheck(chain, ChainType) ? (Chain *)chain : NULL;
 }
 
+/* The answer of a lookup. */
+static PyObject *
+paths_sample(const Paths *self, PyObject *target, PyObject *source, int64_t at, const double *row, int is_static)
+{
+    Sample *sample = (Sample *)PyType_GenericAlloc((PyTypeObject *)self->kind, 0);
+    if (sample == NULL) {
+        return NULL;
+    }
+    Py_INCREF(target);
+    Py_INCREF(source);
+    Py_INCREF(empty_string);
+    sample->parent = target;
+    sample->child = source;
+    sample->authority = empty_string;
+    sample->stamp = at;
+    memcpy(sample->row, row, ROW_SIZE);
+    sample->is_static = (char)is_static;
+    return (PyObject *)sample;
+}
+
 /* None where Python has to look closer. */
 static PyObject *
 paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
@@ -611,7 +730,7 @@ paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
         }
     } else {
         int overflow;
-        if (path->moving == 0 || !PyLong_CheckExact(args[2])) {
+        if (path->up + path->down == 0 || !PyLong_CheckExact(args[2])) {
             Py_RETURN_NONE;
         }
         at = PyLong_AsLongLongAndOverflow(args[2], &overflow);
@@ -622,19 +741,85 @@ paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
     if (chain_at(path, at, row) != ANSWERED) {
         Py_RETURN_NONE;
     }
-    Sample *sample = (Sample *)PyType_GenericAlloc((PyTypeObject *)self->kind, 0);
-    if (sample == NULL) {
+    return paths_sample(self, target, source, at, row, path->moving == 0);
+}
+
+/* One half of a time travel: source in target at a stamp or at `LATEST`; then `*stamp` is the stamp that counts, and
+ * `*is_static` says whether nothing moves. 0 where Python has to look closer, perhaps with an error. */
+static int
+paths_half(const Paths *self, PyObject *target, PyObject *source, PyObject *at, int64_t *stamp, double *row, int *is_static)
+{
+    const Chain *path = paths_find(self, target, source);
+    int overflow = 0;
+    if (path == NULL) {
+        return 0;
+    }
+    if (at == self->latest) {
+        if (path->up + path->down == 0 || !chain_newest(path, stamp)) {
+            return 0;
+        }
+    } else if (PyLong_CheckExact(at)) {
+        *stamp = PyLong_AsLongLongAndOverflow(at, &overflow);
+    } else {
+        return 0;
+    }
+    *is_static = path->moving == 0;
+    return !overflow && chain_at(path, *stamp, row) == ANSWERED;
+}
+
+/* As `paths_answer`, of source at its own stamp, carried through a fixed frame into target: `find_in_time_travel` of
+ * tfbus/tree/lookup.py. */
+static PyObject *
+paths_travel(const Paths *self, PyObject *target, PyObject *source, PyObject *at, PyObject *source_at, PyObject *fixed)
+{
+    int64_t stamp, source_stamp;
+    double first[WIDTH], second[WIDTH];
+    int target_static, source_static;
+    if (!paths_half(self, target, fixed, at, &stamp, first, &target_static)
+        || !paths_half(self, fixed, source, source_at, &source_stamp, second, &source_static)) {
+        if (PyErr_Occurred()) {
+            return NULL;
+        }
+        Py_RETURN_NONE;
+    }
+    compose(first, second, second);
+    if (at == self->latest && target_static && !source_static) {
+        stamp = source_stamp;
+    }
+    return paths_sample(self, target, source, stamp, second, target_static && source_static);
+}
+
+/* can_answer(target, source, at): whether there is an answer; None where Python has to look closer. */
+static PyObject *
+paths_can_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
+{
+    int64_t at;
+    int overflow = 0;
+    if (count != 3) {
+        PyErr_SetString(PyExc_TypeError, "can_answer takes target, source and at");
         return NULL;
     }
-    Py_INCREF(target);
-    Py_INCREF(source);
-    Py_INCREF(empty_string);
-    sample->parent = target;
-    sample->child = source;
-    sample->authority = empty_string;
-    sample->stamp = at;
-    memcpy(sample->row, row, ROW_SIZE);
-    return (PyObject *)sample;
+    const Chain *path = paths_find(self, args[0], args[1]);
+    if (path == NULL && PyErr_Occurred()) {
+        return NULL;
+    }
+    if (path == NULL || path->up + path->down == 0) {
+        Py_RETURN_NONE;
+    }
+    if (args[2] == self->latest) {
+        if (!chain_newest(path, &at)) {
+            return PyBool_FromLong(0);
+        }
+    } else if (PyLong_CheckExact(args[2])) {
+        at = PyLong_AsLongLongAndOverflow(args[2], &overflow);
+    } else {
+        overflow = 1;
+    }
+    const int covered = !overflow && chain_covers(path, at);
+    if (overflow || !(covered || path->alone)) {
+        Py_RETURN_NONE;
+    }
+    return PyBool_FromLong(covered);
 }
 
 /* Bytes that end with the given stamps, and have room for seven floats a stamp before. NULL without an error if they
@@ -785,6 +970,8 @@ paths_set_recent(Paths *self, PyObject *value, void *Py_UNUSED(closure))
 static PyMethodDef paths_methods[] = {
     {"answer", FAST(paths_answer), METH_FASTCALL,
      PyDoc_STR("answer(target, source, at): the plain answer; None if Python has to look closer.")},
+    {"can_answer", FAST(paths_can_answer), METH_FASTCALL,
+     PyDoc_STR("can_answer(target, source, at): whether there is an answer; None if Python has to look closer.")},
     {"answer_many", FAST(paths_answer_many), METH_FASTCALL,
      PyDoc_STR("answer_many(target, source, stamps): the plain answers as bytes, seven columns of floats, and the stamps; "
                "None if Python has to look closer.")},
@@ -801,6 +988,7 @@ static PyGetSetDef paths_getset[] = {
 static PyMemberDef paths_members[] = {
     {"inserted", T_LONGLONG, offsetof(Paths, inserted), 0, PyDoc_STR("The number of samples at new stamps.")},
     {"version", T_LONGLONG, offsetof(Paths, version), 0, PyDoc_STR("Another number after each change.")},
+    {"now", T_OBJECT, offsetof(Paths, now), 0, PyDoc_STR("The clock that ages are counted from: it gives a stamp.")},
     {NULL}
 };
 
@@ -931,15 +1119,116 @@ method_has_defaults(const Method *self, PyObject *const *named, PyObject *names,
     return 1;
 }
 
+/* The oldest and the newest stamp that count as `LATEST`. */
+typedef struct {
+    int64_t oldest, newest;
+} Bounds;
+
+/* Ages of a duration in s around the clock's now, as `Lookups.bounds` in tfbus/buffer/lookups.py gives them; 0 where
+ * Python has to look closer, perhaps with an error. */
+static int
+bounds_of_age(const Paths *paths, PyObject *max_age, Bounds *bounds)
+{
+    if (!PyFloat_CheckExact(max_age) || paths->now == NULL || paths->now == Py_None) {
+        return 0;
+    }
+    const double seconds = PyFloat_AsDouble(max_age), whole = floor(seconds);
+    if (!(0.0 <= seconds && seconds <= 1e9)) {
+        return 0;
+    }
+    PyObject *number = PyObject_CallNoArgs(paths->now);
+    int64_t now;
+    const int known = number != NULL && PyLong_CheckExact(number) && read_stamp(number, &now) == 0;
+    Py_XDECREF(number);
+    if (!known || now < -(INT64_MAX / 2) || now > INT64_MAX / 2) {
+        return 0;
+    }
+    const int64_t age = (int64_t)whole * 1000000000 + (int64_t)nearbyint((seconds - whole) * 1e9);
+    bounds->oldest = now - age;
+    bounds->newest = now + age;
+    return 1;
+}
+
+static int
+read_bound(PyObject *number, int64_t *bound)
+{
+    int overflow = 1;
+    if (PyLong_CheckExact(number)) {
+        *bound = PyLong_AsLongLongAndOverflow(number, &overflow);
+    }
+    return !overflow;
+}
+
+/* The answer of a call with options that the kernel knows: time travel, or the age of `LATEST`. None for any other, and
+ * where there is no such answer. Not inlined, as above. */
+Py_NO_INLINE static PyObject *
+method_answer_with(const Method *self, PyObject *const *args, PyObject *at, PyObject *const *named, PyObject *names,
+                   Py_ssize_t first)
+{
+    PyObject *source_at = Py_None, *fixed = Py_None;
+    Bounds bounds = {INT64_MIN, INT64_MAX};
+    int plain = 1, bounded = 0;
+    PyObject *found = PyObject_GetAttr(args[0], paths_string);
+    if (found == NULL || !PyObject_TypeCheck(found, PathsType)) {
+        PyErr_Clear();
+        Py_XDECREF(found);
+        Py_RETURN_NONE;
+    }
+    Paths *paths = (Paths *)found;
+    for (Py_ssize_t i = first; plain && i < PyTuple_Size(names); i++) {
+        PyObject *name = PyTuple_GetItem(names, i);
+        PyObject *by_default = PyDict_CheckExact(self->defaults) ? PyDict_GetItem(self->defaults, name) : NULL;
+        if (by_default == NULL) {
+            plain = 0;
+        } else if (name == source_at_string) {
+            source_at = named[i];
+        } else if (name == fixed_string) {
+            fixed = named[i];
+        } else if (by_default != named[i]) {
+            plain = (name == not_before_string && read_bound(named[i], &bounds.oldest))
+                    || (name == not_after_string && read_bound(named[i], &bounds.newest))
+                    || (name == max_age_string && bounds_of_age(paths, named[i], &bounds));
+            bounded = 1;
+        }
+    }
+    PyObject *answer = Py_None, *when = at == NULL ? paths->latest : at;
+    PyObject *question[3] = {args[1], args[2], when};
+    if (PyErr_Occurred()) {
+        answer = NULL;
+    } else if (!plain || (source_at == Py_None) != (fixed == Py_None)
+               || (bounded && (fixed != Py_None || when != paths->latest))) {
+        Py_INCREF(answer);
+    } else if (fixed != Py_None) {
+        answer = paths_travel(paths, args[1], args[2], when, source_at, fixed);
+    } else {
+        answer = paths_answer(paths, question, 3);
+        const Sample *sample = (const Sample *)answer;
+        if (answer != NULL && answer != Py_None && !sample->is_static
+            && !(bounds.oldest <= sample->stamp && sample->stamp <= bounds.newest)) {
+            Py_DECREF(answer);
+            answer = Py_None;
+            Py_INCREF(answer);
+        }
+    }
+    Py_DECREF(found);
+    return answer;
+}
+
 /* By PEP 590. A plain call has only the object, target, source, and the stamp or stamps; all else are defaults. */
 static PyObject *
 method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject *names)
 {
     const Py_ssize_t count = (Py_ssize_t)(flagged & ~((size_t)1 << (8 * sizeof(size_t) - 1)));
     const int at_is_named = count == 3 && names != NULL && PyTuple_Size(names) > 0 && PyTuple_GetItem(names, 0) == at_string;
-    if ((count == 4 || (self->many == NULL && count == 3))
-        && (names == NULL || method_has_defaults(self, args + count, names, at_is_named))) {
-        PyObject *found = method_answer(self, args[0], args[1], args[2], count == 4 || at_is_named ? args[3] : NULL);
+    if (count == 4 || (self->many == NULL && count == 3)) {
+        PyObject *at = count == 4 || at_is_named ? args[3] : NULL, *found;
+        if (names == NULL || method_has_defaults(self, args + count, names, at_is_named)) {
+            found = method_answer(self, args[0], args[1], args[2], at);
+        } else if (self->many == NULL) {
+            found = method_answer_with(self, args, at, args + count, names, at_is_named);
+        } else {
+            return method_run(self, args, count, names);
+        }
         if (found != Py_None) {
             return found;
         }

@@ -467,6 +467,7 @@ static PyType_Spec block_spec = {
 typedef struct {
     PyObject_HEAD
     PyObject *parent, *authority; /* plain str, of the newest sample */
+    PyObject *static_stamp;       /* the stamp of the sample that holds at every stamp, in ns; None or NULL for none */
     Block *block;                 /* NULL until there is a sample */
     Py_ssize_t start, end;        /* the samples in the window */
     Block *next;                  /* the block that it moves into, or NULL */
@@ -1070,6 +1071,7 @@ history_dealloc(History *self)
 {
     Py_XDECREF(self->parent);
     Py_XDECREF(self->authority);
+    Py_XDECREF(self->static_stamp);
     history_change_block(self, NULL, 0);
     let_go_of(OBJECT(self));
 }
@@ -1112,6 +1114,8 @@ static PyGetSetDef history_getset[] = {
 
 static PyMemberDef history_members[] = {
     {"mixed", T_BOOL, offsetof(History, mixed), 0, PyDoc_STR("Whether the samples name several parents.")},
+    {"static_stamp", T_OBJECT, offsetof(History, static_stamp), 0,
+     PyDoc_STR("The stamp of the sample that holds at every stamp, in ns; None if there is none.")},
     {NULL}
 };
 

@@ -1,5 +1,6 @@
 """The buffer: a tree that a bus fills, and lookups that wait for missing transforms."""
 
+import time
 from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Any, SupportsIndex, TypeVar
@@ -9,6 +10,7 @@ import anyio.lowlevel
 from tfbus.buffer.lookups import LocalNames, Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
+from tfbus.clock import SystemClock
 from tfbus.data import Stamped, do_transform
 from tfbus.errors import ExtrapolationError, TransformLookupError
 from tfbus.frames import as_prefix, is_frame
@@ -106,6 +108,8 @@ class Buffer:
             bus._check_thread()
             self._forest = forest_of(tree).copy_within(window)
         self._paths = self._forest.paths if named is None else self._forest.local_paths
+        # A class derived from the clock may tell the time in another way.
+        self._paths.now = time.time_ns if type(bus.clock) is SystemClock else bus.clock.now
         self._tree = tree_of(self._forest, keep, bus.max_translation)
         self._live = LiveTree(self._forest, bus._announce_past_loop)
         self._lookups = Lookups(self._live, bus, self._local_names)
@@ -319,7 +323,12 @@ class Buffer:
         TypeError
             As `transform`.
         """
-        question = question_of(data, target, as_at(at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
+        policy = policy_of(tolerance, max_gap, extrapolate)
+        if at is None and fixed is None and max_age is None and policy is None:
+            plain = self._paths.answer(target, getattr(data, "frame", ""), getattr(data, "stamp", None))
+            if plain is not None:
+                return do_transform(data, plain)
+        question = question_of(data, target, as_at(at), fixed, max_age, policy)
         if self._is_in_place(question):
             return data
         return do_transform(data, self._lookups.lookup_nowait(self._on_bus(question)))
@@ -354,6 +363,9 @@ class Buffer:
 
     def can_transform(self, target: str, source: str, at: AtLike = LATEST, **question: Any) -> bool:
         """Whether `lookup_nowait` with the same arguments has an answer now."""
+        known = None if question else self._paths.can_answer(target, source, at)
+        if known is not None:
+            return known
         try:
             self.lookup_nowait(target, source, at, **question)
         except TransformLookupError:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data.dispatch import CopiedByFields, as_points, check_header, do_transform, moved_header
+from tfbus.data.dispatch import CopiedByFields, as_points, check_header, do_transform, made, moved_header
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform_array import read_only
 from tfbus.plain import PlainData
@@ -79,4 +79,5 @@ def _column(name: object, values: npt.ArrayLike, length: int) -> npt.NDArray[Any
 @do_transform.register
 def _(data: PointCloud, transform: TransformStamped) -> PointCloud:
     header = moved_header(data, transform)
-    return PointCloud(*header, transform.transform.apply(data.points), data.stamps, data.fields)
+    points = read_only(transform.transform.apply(data.points))
+    return made(PointCloud, *header, points, data.stamps, data.fields)

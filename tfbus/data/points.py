@@ -13,14 +13,16 @@ from tfbus.data.dispatch import (
     check_pose,
     construct,
     do_transform,
+    made,
     moved_header,
 )
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.geometry.transform import Transform
+from tfbus.geometry.transform import Transform, from_row
 from tfbus.geometry.transform_array import locked
 from tfbus.plain import PlainData
 from tfbus.rows import Numbers, Quaternion, Vector, as_rotation, rotate
 from tfbus.stamps import AtLike, Latest
+from tfbus.which_kernel import compose_rows, move_point
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,12 +153,12 @@ class Polygon(CopiedByFields, PlainData):
 
 @do_transform.register
 def _(data: PointStamped, transform: TransformStamped) -> PointStamped:
-    return PointStamped(*moved_header(data, transform), transform.transform.apply(data.point))
+    return made(PointStamped, *moved_header(data, transform), move_point(transform._row, data.point))
 
 
 @do_transform.register
 def _(data: Vector3Stamped, transform: TransformStamped) -> Vector3Stamped:
-    return Vector3Stamped(*moved_header(data, transform), rotate(transform.transform.rotation, *data.vector))
+    return made(Vector3Stamped, *moved_header(data, transform), rotate(transform._row[3:], *data.vector))
 
 
 @do_transform.register
@@ -167,7 +169,8 @@ def _(data: QuaternionStamped, transform: TransformStamped) -> QuaternionStamped
 
 @do_transform.register
 def _(data: PoseStamped, transform: TransformStamped) -> PoseStamped:
-    return PoseStamped(*moved_header(data, transform), transform.transform @ data.pose)
+    moved = from_row(compose_rows(transform._row, data.pose._row))
+    return made(PoseStamped, *moved_header(data, transform), moved)
 
 
 @do_transform.register

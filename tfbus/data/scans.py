@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import KW_ONLY, dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tfbus.data.clouds import PointCloud
-from tfbus.data.dispatch import CopiedByFields, as_floats, check_header
+from tfbus.data.dispatch import CopiedByFields, as_floats, check_header, made
 from tfbus.geometry.transform_array import read_only
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, Latest, as_array, as_stamp, from_seconds, is_real
@@ -108,21 +109,28 @@ class LaserScan(CopiedByFields, PlainData):
             laser_geometry.
         """
         ranges = self.ranges
-        # The limits are rounded as the ranges are, so that a range at a limit is valid. A huge limit becomes infinite.
-        with np.errstate(over="ignore"):
-            low, high = np.array((self.range_min, self.range_max)).astype(ranges.dtype)
-        index = np.flatnonzero(np.isfinite(ranges) & (ranges >= low) & (ranges <= high))
+        low, high = self.range_min, self.range_max
+        if ranges.dtype != np.float64:
+            # The limits are rounded as the ranges are, so a range at a limit is valid. A huge one becomes infinite.
+            with np.errstate(over="ignore"):
+                low, high = np.array((low, high)).astype(ranges.dtype)
+        above = ranges > low if low == -math.inf else ranges >= low
+        below = ranges < high if high == math.inf else ranges <= high
+        index = (above & below).nonzero()[0]
+        if len(index) < len(ranges):
+            ranges = ranges[index]
         angles = self.angle_min + index * self.angle_increment
         points = np.zeros((len(index), 3), ranges.dtype)
-        points[:, 0] = ranges[index] * np.cos(angles)
-        points[:, 1] = ranges[index] * np.sin(angles)
+        np.multiply(ranges, np.cos(angles), points[:, 0])
+        np.multiply(ranges, np.sin(angles), points[:, 1])
         stamps = None
         if not isinstance(self.stamp, Latest):
-            stamps = self.stamp + np.rint(index * self.time_increment * SECOND).astype(np.int64)
-        fields = {"index": index}
+            elapsed: Any = np.rint(index * self.time_increment * SECOND).astype(np.int64) if self.time_increment else 0
+            stamps = read_only(np.full(len(index), self.stamp, np.int64) + elapsed)
+        fields = {"index": read_only(index)}
         if self.intensities is not None:
-            fields["intensities"] = self.intensities[index]
-        return PointCloud(self.frame, self.stamp, points, stamps, fields)
+            fields["intensities"] = read_only(self.intensities[index])
+        return made(PointCloud, self.frame, self.stamp, read_only(points), stamps, MappingProxyType(fields))
 
 
 def _number(value: object, name: str) -> float:

@@ -15,6 +15,7 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
+from tfbus import _python_kernel
 from tfbus.errors import InvalidTransformError
 from tfbus.plain import from_fields
 from tfbus.rows import (
@@ -28,12 +29,11 @@ from tfbus.rows import (
     as_floats,
     as_rotation,
     as_vector,
-    compose,
     interpolate,
-    invert,
     rotate,
 )
 from tfbus.stamps import as_array
+from tfbus.which_kernel import compose_rows, fill_matrix, invert_row, move_point, move_points, row_of_matrix
 
 
 class Transform:
@@ -93,8 +93,8 @@ class Transform:
     def from_matrix(cls, matrix: npt.ArrayLike) -> "Transform":
         """From a homogeneous matrix of shape (4, 4).
 
-        If the rotation part is within 1 % of a rotation, it is projected on the nearest rotation (Bar-Itzhack 2000, as
-        transforms3d does it).
+        The quaternion has w >= 0. If the rotation part is within 1 % of a rotation, it is projected on the nearest one
+        (Bar-Itzhack 2000, as transforms3d does it); within 1e-14, its quaternion is read from its elements.
 
         Raises
         ------
@@ -102,9 +102,12 @@ class Transform:
             If the shape is not (4, 4), a number is not finite, the last row is not (0, 0, 0, 1), or the rotation part
             is not a rotation.
         """
+        m = as_array(matrix, "matrix", np.float64)
+        row = row_of_matrix(m)
+        if row is not None:
+            return from_row(row)
         from transforms3d.quaternions import mat2quat
 
-        m = as_array(matrix, "matrix", np.float64)
         if m.shape != (4, 4):
             raise InvalidTransformError(f"matrix must have shape (4, 4), got {m.shape}", reason="wrong length")
         if not np.isfinite(m).all():
@@ -211,21 +214,16 @@ class Transform:
 
     def matrix(self) -> npt.NDArray[np.float64]:
         """A new homogeneous matrix of shape (4, 4)."""
-        from transforms3d.quaternions import quat2mat
-
-        matrix = np.eye(4)
-        matrix[:3, :3] = quat2mat(self.as_wxyz())
-        matrix[:3, 3] = self.translation
-        return matrix
+        return fill_matrix(self._row, np.empty((4, 4)))
 
     def inverse(self) -> "Transform":
         """The transform that undoes this one."""
-        return from_row(invert(self._row))
+        return from_row(invert_row(self._row))
 
     def __matmul__(self, other: "Transform") -> "Transform":
         if not isinstance(other, Transform):
             return NotImplemented
-        return from_row(compose(self._row, other._row))
+        return from_row(compose_rows(self._row, other._row))
 
     @overload
     def apply(self, points: npt.NDArray[Any]) -> npt.NDArray[Any]: ...
@@ -248,6 +246,9 @@ class Transform:
         ValueError
             If the shape does not end in 3. The message has the shape.
         """
+        moved = move_point(self._row, points)
+        if moved is not None:
+            return moved
         if not isinstance(points, np.ndarray):
             if len(points) != 3:
                 raise ValueError(f"a point is three numbers, got shape ({len(points)},); points go in an array")
@@ -258,17 +259,14 @@ class Transform:
             except TypeError:
                 raise ValueError(f"a point is three numbers, not {points!r}; points go in an array") from None
             return float(tx + rx), float(ty + ry), float(tz + rz)
-        from transforms3d.quaternions import quat2mat
-
         points = as_array(points, "points")
         if points.ndim == 0 or points.shape[-1] != 3:
             raise ValueError(f"points must have shape (..., 3), got {points.shape}")
-        dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.dtype(np.float64)
-        rotation = quat2mat(self.as_wxyz()).T.astype(dtype)
-        with np.errstate(invalid="ignore"):
-            moved: npt.NDArray[Any] = points @ rotation
-            moved += np.asarray(self.translation, dtype)
-        return moved
+        points = np.ascontiguousarray(points, points.dtype if points.dtype.kind == "f" else np.float64)
+        out = np.empty_like(points)
+        if not move_points(self._row, points, out):
+            _python_kernel.move_points(self._row, points, out)
+        return out
 
     def interpolate(self, other: "Transform", fraction: float) -> "Transform":
         """The transform a `fraction` of the way to `other`: translation linear, rotation along the shorter arc.

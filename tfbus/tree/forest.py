@@ -21,23 +21,37 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.errors import MOST_NAMES, DisconnectedError, ExtrapolationError, FutureExtrapolationError, UnknownFrameError
+from tfbus.errors import (
+    MOST_NAMES,
+    DisconnectedError,
+    ExtrapolationError,
+    FutureExtrapolationError,
+    UnknownFrameError,
+    error_of,
+)
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.rows import IDENTITY, Row, compose, invert
-from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_stamp
+from tfbus.stamps import LATEST, STAMP_MIN, Latest, as_stamp
 from tfbus.tree.cycles import Frames, Loop, admit, edges_above, names_below, past_loop
 from tfbus.tree.history import FrameHistory, Outcome, SavedFrame, load_frame
 from tfbus.which_kernel import Chain, Paths, commit
 
 
 class KnownFrames:
-    """Counts the samples that name each frame, so that a frame is forgotten with the last sample that names it."""
+    """Counts the samples that name each frame, so that a frame is forgotten with the last sample that names it.
 
-    __slots__ = ("_mentions", "_parents_of", "_roots", "_some", "_sorted")
+    Attributes
+    ----------
+    changing : int
+        The number of children whose samples name several parents.
+    """
+
+    __slots__ = ("_mentions", "_parents_of", "_roots", "_some", "_sorted", "changing")
 
     def __init__(self) -> None:
         self._parents_of: dict[str, tuple[str, ...]] = {}
         self._mentions: dict[str, int] = {}
+        self.changing = 0
         # Parents without a parent of their own.
         self._roots: set[str] = set()
         self._sorted: tuple[str, ...] | None = None
@@ -64,6 +78,7 @@ class KnownFrames:
             if parent not in self._parents_of:
                 self._roots.add(parent)
         self._forget_mentions(before or ())
+        self.changing += len(parents) > 1
         self._parents_of[child] = parents
         self._roots.discard(child)
         self._sorted = self._some = None
@@ -107,9 +122,11 @@ class KnownFrames:
         twin._parents_of = self._parents_of.copy()
         twin._mentions = self._mentions.copy()
         twin._roots = self._roots.copy()
+        twin.changing = self.changing
         return twin
 
     def _forget_mentions(self, parents: tuple[str, ...]) -> None:
+        self.changing -= len(parents) > 1
         for parent in parents:
             self._mentions[parent] -= 1
             if not self._mentions[parent]:
@@ -140,38 +157,28 @@ class Path(Chain):
         The other way round a loop, if the samples of neither way cover the stamp.
     """
 
-    __slots__ = ("_changing", "_static", "frames", "moving", "permanent", "rival", "root")
+    __slots__ = ("_changing", "frames", "moving", "permanent", "rival", "root")
     up: tuple[Step, ...]
     down: tuple[Step, ...]
 
     def __init__(self, ups: list[FrameHistory], downs: list[FrameHistory], root: str) -> None:
-        super().__init__(_fold(ups), _fold(downs))
         edges = ups + downs
+        super().__init__(_fold(ups), _fold(downs), tuple(edge for edge in edges if edge.static))
         self.root = root
         self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
         self.moving = tuple(edge for edge in edges if not edge.static)
         self._changing = tuple(edge for edge in edges if edge.mixed)
         self.permanent = not self._changing
         self.rival: Path | None = None
-        self._static = tuple(edge for edge in edges if edge.static)
 
     @property
     def children(self) -> list[str]:
         """The children of its edges, sorted."""
         return sorted(frame for frame in self.frames if frame != self.root)
 
-    @property
-    def static_stamp(self) -> int:
-        """The newest stamp among the static samples, in ns. A static sample sent again changes it, but not the path."""
-        return max((edge.static_stamp or 0 for edge in self._static), default=0)
-
     def holds(self, at: int) -> bool:
         """Whether the newest parents on this path also hold at a stamp."""
         return all(edge.parent_at(at) == edge.parent for edge in self._changing)
-
-    def covers(self, at: int) -> bool:
-        """Whether the samples of every edge cover a stamp."""
-        return all(edge.covers(at) for edge in self.moving)
 
     def row_at(self, at: int) -> Row:
         """The row of source in target at a stamp, by the kernel, or step by step if the kernel hands it back.
@@ -222,15 +229,9 @@ class Path(Chain):
         return error
 
     def _own_error(self, at: int) -> ExtrapolationError:
-        lagging, reached = self.moving[0], STAMP_MAX
-        for edge in self.moving:
-            oldest, newest = edge.oldest, edge.newest
-            if oldest is not None and newest is not None and newest >= at:
-                if oldest > at:
-                    return edge.extrapolation_error(at)
-            elif (came_to := STAMP_MIN if newest is None else newest) < reached:
-                lagging, reached = edge, came_to
-        return lagging.extrapolation_error(at)
+        edge: Any = self.deciding(at)
+        error: ExtrapolationError = edge.extrapolation_error(at)
+        return error
 
 
 def _climb(steps: tuple[Step, ...], at: int) -> Row:
@@ -396,6 +397,7 @@ class _Climber:
 
 
 _GENERATION = 10_000
+_NO_PATHS: Mapping[str, Chain] = {}
 
 
 class PathCache(Paths):
@@ -422,18 +424,17 @@ class PathCache(Paths):
 
     def find(self, target: str, source: str) -> Path | None:
         """The path between two frames, if it is kept."""
-        for paths in (self.recent, self._older):
-            by_source = paths.get(target)
-            path = None if by_source is None else by_source.get(source)
-            if isinstance(path, Path):
-                if paths is not self.recent:
-                    self.keep(target, source, path)
-                return path
-        return None
+        # Only `keep` fills them.
+        path: Path | None = self.recent.get(target, _NO_PATHS).get(source)  # type: ignore[assignment]
+        if path is None:
+            path = self._older.get(target, _NO_PATHS).get(source)  # type: ignore[assignment]
+            if path is not None:
+                self.keep(target, source, path)
+        return path
 
     def holds(self, target: str, source: str) -> bool:
         """Whether the path between two frames is kept. May be asked without the lock."""
-        return any(source in paths.get(target, ()) for paths in (self.recent, self._older))
+        return source in self.recent.get(target, _NO_PATHS) or source in self._older.get(target, _NO_PATHS)
 
     def keep(self, target: str, source: str, path: Path) -> None:
         """Keep a permanent path."""
@@ -686,7 +687,8 @@ class Forest:
         suspects, self._suspects = self._suspects, []
         for sample in suspects:
             child = sample.child
-            if child in self.frames:
+            # A loop consists of parents.
+            if child in self.frames and child in self.names.parents:
                 loop = past_loop(self.frames, child, STAMP_MIN if sample.static else sample.stamp)
                 if loop is not None:
                     self.looping.append(LoopingSample(sample, loop))
@@ -708,24 +710,30 @@ class Forest:
 
     # Questions
 
-    def search(self, target: str, source: str) -> None:
+    def search(self, target: str, source: str) -> bool:
         """Find the newest path and keep it. The climb may take long, and runs without the lock.
 
         If a change may have made the path wrong meanwhile, or there is no path, nothing is kept: the lookup that
         follows finds the path, or the error, under the lock.
+
+        Returns
+        -------
+        bool
+            Whether both frames were known.
         """
         if self.paths.holds(target, source) or (target, source) in self.changing_paths:
-            return
+            return True
         structure = self.structure
         if target not in self.names or source not in self.names:
-            return
+            return False
         try:
             edges = find_edges(self.frames, target, source, None)
         except DisconnectedError:
-            return
+            return True
         with self.lock:
             if self.structure == structure:
                 self._keep(target, source, Path(*edges))
+        return True
 
     def find_path(self, target: str, source: str, at: int | Latest) -> Path:
         """The path between two frames that counts at a stamp (see `path_at`), or the one by the newest parents.
@@ -759,6 +767,8 @@ class Forest:
 
     def _keep(self, target: str, source: str, path: Path) -> None:
         if path.permanent:
+            # A loop at a past stamp needs a frame that changes its parent. One that begins to do so empties the cache.
+            path.alone = path.root not in self.frames or not self.names.changing
             self.paths.keep(target, source, path)
         else:
             if len(self.changing_paths) >= _CHANGING_PATHS_KEPT:
@@ -789,7 +799,7 @@ class Forest:
         if frame not in self.names:
             if not isinstance(frame, str):
                 raise TypeError(f"a frame name must be a str, not {frame!r}")
-            raise UnknownFrameError(frame=frame, known=self.names.some())
+            raise error_of(UnknownFrameError, {"frame": frame, "_known": self.names.some()})
 
     def edges_above(self, *names: str) -> list[FrameHistory]:
         """The edges of some frames and of all above them, by any parent that a sample in the window names."""
@@ -893,6 +903,8 @@ class Forest:
 
     def _drop_emptied_loop(self, history: FrameHistory) -> None:
         """Drop frames without samples that are now in a loop: their last parent no longer holds."""
+        if history.child not in self.names.parents:
+            return
         walk = {history: None}
         here = history
         while (above := self.frames.get(here.parent)) is not None and above not in walk:

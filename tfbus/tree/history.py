@@ -21,6 +21,7 @@ from tfbus.errors import (
     ExtrapolationError,
     FutureExtrapolationError,
     PastExtrapolationError,
+    error_of,
 )
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import from_row
@@ -220,13 +221,12 @@ class FrameHistory(History):
         clears it.
     """
 
-    __slots__ = ("_authorities", "_parents", "changed", "child", "static", "static_row", "static_stamp")
+    __slots__ = ("_authorities", "_parents", "changed", "child", "static", "static_row")
 
     def __init__(self, child: str, parent: str, static: bool, keep: int | None) -> None:
         super().__init__(parent, keep)
         self.child = child
         self.static = static
-        self.static_stamp: int | None = None
         self.static_row: Row = IDENTITY
         self.changed = False
         self._parents = Runs()
@@ -343,7 +343,17 @@ class FrameHistory(History):
         oldest, newest = self.oldest, self.newest
         past = oldest is not None and isinstance(stamp, int) and stamp < oldest
         kind = PastExtrapolationError if past else FutureExtrapolationError
-        return kind(child=self.child, stamp=stamp, oldest=oldest, newest=newest, authority=self.authority, slack=slack)
+        return error_of(
+            kind,
+            {
+                "child": self.child,
+                "stamp": stamp,
+                "oldest": oldest,
+                "newest": newest,
+                "authority": self.authority,
+                "slack": slack,
+            },
+        )
 
     def parent_changes(self) -> list[int]:
         """The stamps inside the window at which the parent changes."""

@@ -332,13 +332,17 @@ def answer(
     if type(at) is not int and at is not LATEST:
         at = as_stamp(at)
     extrapolation = None if policy is None else Extrapolation(policy)
+    known = True
     if fixed is None:
-        forest.search(target, source)
+        known = forest.search(target, source)
     else:
         forest.search(target, fixed)
         forest.search(fixed, source)
     with forest.lock:
         if source_at is None and fixed is None:
+            if not known:
+                forest.check_known(target)
+                forest.check_known(source)
             stamp, row, static = find(forest, target, source, at, bounds, extrapolation)
         else:
             stamp, row, static = find_in_time_travel(
@@ -358,23 +362,23 @@ def find(
         path = forest.find_path(target, source, at)
     if not path.moving:
         if isinstance(at, Latest):
-            at = path.static_stamp if len(path.frames) > 1 else _newest_stamp(forest, target)
+            newest = path.latest()
+            at = _newest_stamp(forest, target) if newest is None else newest
         return as_stamp(at), path.row_at(0), True
     if at is LATEST:
         return _find_latest(forest, path, bounds, extrapolation)
     if extrapolation is not None:
         return at, _extrapolated(forest.find_path(target, source, at), at, extrapolation), False
-    try:
-        return at, path.row_at(as_stamp(at)), False
-    except ExtrapolationError:
-        # Another edge, or another way, may decide. That is found outside, so that an error keeps no traceback of this
-        # one alive.
-        pass
-    if path.root in forest.frames:
-        path = forest.find_path(target, source, at)
-        if path.covers(at):
-            return at, path.row_at(at), False
-    raise path.deciding_error(as_stamp(at))
+    stamp = as_stamp(at)
+    row = path.row(stamp)
+    if row is not None:
+        return stamp, row, False
+    if not (path.covers(stamp) or path.alone) and path.root in forest.frames:
+        # Another edge, or another way, may decide.
+        path = forest.find_path(target, source, stamp)
+    if not path.covers(stamp):
+        raise path.deciding_error(stamp)
+    return stamp, path.row_at(stamp), False
 
 
 def _extrapolated(path: Path, at: int, extrapolation: Extrapolation) -> Row:

@@ -12,6 +12,12 @@ from tfbus.tree.history import STALE_AFTER, Edge, EdgeState, state_of
 _LONGEST_KEY = 1_024
 """The greatest length of a key in YAML, as it is written, without a question mark before it."""
 
+_LEVEL = 4
+_LONGEST_INDENT = 64 * _LEVEL
+"""The greatest length of the lines before a frame. Deeper trees would take a text of quadratic length."""
+_OUTER = "…   "
+"""In place of the lines that are left out."""
+
 
 def describe(edges: Sequence[Edge], now: int | None = None) -> str:
     """The edges as an indented tree, one frame a line, with rate, age, span and authority.
@@ -73,7 +79,10 @@ class Branch(NamedTuple):
 
 
 def branches(edges: Sequence[Edge]) -> Iterator[Branch]:
-    """The lines of a drawn tree, roots first. A loop of parents is opened at one of its frames."""
+    """The lines of a drawn tree, roots first. A loop of parents is opened at one of its frames.
+
+    Below 64 levels, the outer lines before a frame are left out.
+    """
     below: dict[str, list[Edge]] = {}
     for edge in edges:
         below.setdefault(edge.parent, []).append(edge)
@@ -101,6 +110,8 @@ def branches(edges: Sequence[Edge]) -> Iterator[Branch]:
 
 
 def _stacked(edges: list[Edge], indent: str) -> list[tuple[Edge, str, str]]:
+    if len(indent) >= _LONGEST_INDENT:
+        indent = _OUTER + indent[len(_OUTER) + _LEVEL :]
     rows = [(edge, f"{indent}├── ", f"{indent}│   ") for edge in edges[:-1]]
     rows += [(edge, f"{indent}└── ", f"{indent}    ") for edge in edges[-1:]]
     return rows[::-1]

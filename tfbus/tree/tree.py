@@ -280,6 +280,9 @@ class TransformTree:
 
     def can_transform(self, target: str, source: str, at: AtLike = LATEST, **question: Any) -> bool:
         """Whether `lookup` with the same arguments has an answer now."""
+        known = None if question else self._paths.can_answer(target, source, at)
+        if known is not None:
+            return known
         try:
             self.lookup(target, source, at, **question)
         except TransformLookupError:
