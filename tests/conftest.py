@@ -19,9 +19,7 @@ A test, or a file of tests, that needs an extra which is not installed is skippe
 import gc
 import logging
 import os
-import shutil
 import signal
-import tempfile
 from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -72,15 +70,17 @@ def pytest_configure(config: pytest.Config) -> None:
     if is_default_suite(config) and all("::" in argument for argument in config.args):
         config.option.markexpr = ""
     settings.load_profile("default" if is_default_suite(config) else "thorough")
-    keep_tables_of_hypothesis_elsewhere(config)
+    keep_tables_of_hypothesis_elsewhere()
     hear_ctrl_c()
 
 
-def keep_tables_of_hypothesis_elsewhere(config: pytest.Config) -> None:
-    """Have hypothesis write to a temporary folder what it would write to the checkout."""
-    tables = Path(tempfile.mkdtemp(prefix="tfbus-hypothesis-"))
-    configuration.set_hypothesis_home_dir(tables)
-    config.add_cleanup(lambda: shutil.rmtree(tables, ignore_errors=True))
+def keep_tables_of_hypothesis_elsewhere() -> None:
+    """Have hypothesis write to a cache of the user what it would write to the checkout.
+
+    These are the tables of Unicode and the constants of all modules, which take each process some seconds to collect.
+    """
+    caches = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+    configuration.set_hypothesis_home_dir(Path(caches, "tfbus-hypothesis"))
 
 
 def hear_ctrl_c() -> None:

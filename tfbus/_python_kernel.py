@@ -669,6 +669,23 @@ def decode(
     return [], at
 
 
+def columns(
+    parents: str | tuple[str, ...],  # noqa: ARG001
+    children: str | tuple[str, ...],  # noqa: ARG001
+    stamps: Stamps,  # noqa: ARG001
+    rows: npt.NDArray[np.float64],  # noqa: ARG001
+    authority: str,  # noqa: ARG001
+    static: bool,  # noqa: ARG001
+    square: float,  # noqa: ARG001
+) -> Any:
+    """The rows of some columns as a batch, if all are plain; their quaternions are normalised in place.
+
+    A row is plain if its names can name two frames, its quaternion is a unit quaternion within 1 %, and the square of
+    its translation, in m^2, is at most `square`. Here none is: `tfbus.geometry.columns` makes a sample of each.
+    """
+    return None
+
+
 def commit(frames: Mapping[str, History], batch: Sequence[Sample], first: int) -> int:
     """Store the samples of a batch from the index `first` on, up to the first that does not continue its history.
 

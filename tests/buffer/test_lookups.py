@@ -12,7 +12,7 @@ import anyio.lowlevel
 import anyio.to_thread
 import pytest
 from anyio.abc import TaskGroup
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.asking import Asked, driving, settle
 from support.samples import any_samples, moving, static
@@ -198,7 +198,6 @@ some_samples = any_samples("abcd", 20) | st.builds(
 )
 
 
-@settings(max_examples=30)
 @given(
     st.integers(0, 5),
     st.lists(st.lists(some_samples, min_size=1, max_size=3) | st.sampled_from("bcd"), min_size=5, max_size=15),

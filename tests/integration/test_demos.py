@@ -251,6 +251,7 @@ def test_the_demo_of_a_path_agrees_with_the_cycloid_that_the_tool_goes_along() -
     assert late == "at 5 s and 11 s there is an answer: [True, False]"
 
 
+@pytest.mark.thorough
 def test_the_demo_of_drivers_in_threads_loses_nothing_and_keeps_each_drivers_order() -> None:
     refused, counted, apart = output_of("driver_threads.py")
     assert re.fullmatch(r"RuntimeError: .*bus\.threadsafe.*", refused)

@@ -19,11 +19,11 @@ pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
 thorough = pytest.mark.thorough
 
 BACKENDS = ("asyncio", "trio", "asyncio+uvloop")
-SECONDS = 10
+SECONDS = 4
 BLOCKED = 3.0
 """The seconds for which a slow process does not return to its event loop."""
 RATE = 500 / 3
-"""Batches of 20 that each of three processes sends a second: 10,000 samples in all."""
+"""Batches of 20 that each of three processes sends a second: 10,000 samples a second in all."""
 SOON = 3.0
 """s; so long after the end of a trouble everything is told."""
 
@@ -34,7 +34,7 @@ def processes() -> Iterator[Crowd]:
         yield together
 
 
-@pytest.fixture(params=["local", "router"])
+@pytest.fixture(params=["local", pytest.param("router", marks=thorough)])
 def place(request: pytest.FixtureRequest) -> Place:
     return Place(request.param)
 
@@ -114,7 +114,7 @@ def test_processes_may_start_in_any_order(processes: Crowd, place: Place) -> Non
 
 
 @pytest.mark.parametrize("drop_lost", [False, pytest.param(True, marks=thorough)])
-def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_late_joiners_and_restarted_ones(
+def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_and_for_late_joiners(
     drop_lost: bool, processes: Crowd, place: Place
 ) -> None:
     listener = processes.add(place.first(drop_lost=drop_lost))
@@ -131,8 +131,8 @@ def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_late_
         assert len(process.said(event="PeerJoined")) == 2
     other.kill()
     kept = {"own": 0.0} if drop_lost else {"own": 0.0, "lidar": 1.0, "camera": 1.0, "base": 1.0}
-    late, restarted = (processes.add(place.other(drop_lost=drop_lost)) for _ in range(2))
-    together = (listener, late, restarted)
+    late = processes.add(place.other(drop_lost=drop_lost))
+    together = (listener, late)
     for process in together:
         process.ask("until", x=kept, lacks=[name for name in ("lidar", "camera", "base") if name not in kept])
     # The samples of the next process are newer, on every bus.
@@ -144,13 +144,14 @@ def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_late_
         assert process.ask("facts")["x"] == kept | {"lidar": 2.0}
     # A removal is for all that comes later.
     late.ask("remove", frame="lidar")
-    restarted.ask("until", lacks=["lidar"])
+    again.ask("until", lacks=["lidar"])
     latest = processes.add(place.other(drop_lost=drop_lost))
-    latest.ask("until", x={name: x for name, x in kept.items() if name != "lidar"}, peers=4)
+    latest.ask("until", x={name: x for name, x in kept.items() if name != "lidar"}, peers=3)
     assert "lidar" not in latest.ask("facts")["x"]
 
 
-@pytest.mark.parametrize("seconds", [1.5, *(pytest.param(seconds, marks=thorough) for seconds in (7.0, 30.0))])
+@thorough
+@pytest.mark.parametrize("seconds", [1.5, 12.0])
 def test_a_frame_that_moves_once_while_a_peer_is_frozen_comes_to_it(
     seconds: float, processes: Crowd, place: Place
 ) -> None:

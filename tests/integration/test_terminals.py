@@ -12,7 +12,7 @@ from support.recorded import SMALL
 
 from tfbus.cli.output import cells
 
-pytestmark = [pytest.mark.thorough, pytest.mark.parametrize("width", [60, 80, 120, 200])]
+pytestmark = [pytest.mark.thorough, pytest.mark.parametrize("width", [60, 80, 200])]
 
 ARM = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
 URDFS = [pytest.param(ARM, id="arm"), pytest.param(pr2.URDF, id="PR2", marks=pr2.needed)]

@@ -1,5 +1,9 @@
-"""The promise of the link: some seconds after any trouble, all buses of a domain hold the same."""
+"""The promise of the link: some seconds after any trouble, all buses of a domain hold the same.
 
+`CONVERGENCE_SEEDS` in the environment is the number of random runs that the thorough suite has of each kind of trouble.
+"""
+
+import os
 from collections.abc import Sequence
 
 import pytest
@@ -10,6 +14,13 @@ from tfbus.links.message import Kind
 
 NAMES = [f"static{k}" for k in range(5)]
 LIMIT = 10.0
+SEEDS = int(os.environ.get("CONVERGENCE_SEEDS", "100"))
+
+
+def few_or_many(few: int, many: int) -> pytest.MarkDecorator:
+    """The first seeds in the default suite, and the others in the thorough one."""
+    rest = pytest.param(range(few, many), marks=pytest.mark.thorough)
+    return pytest.mark.parametrize("seeds", [range(few), rest], ids=["few", "many"])
 
 
 PLACES = {
@@ -104,9 +115,7 @@ def until_they_agree(world: World, groups: list[list[Process]]) -> None:
 
 
 @pytest.mark.parametrize("drop_lost", [False, True])
-@pytest.mark.parametrize(
-    "seeds", [range(10), pytest.param(range(10, 1_000), marks=pytest.mark.thorough)], ids=["few", "many"]
-)
+@few_or_many(3, SEEDS)
 def test_all_buses_show_the_same_some_seconds_after_any_trouble(seeds: range, drop_lost: bool) -> None:
     for seed in seeds:
         world = World(seed)
@@ -119,9 +128,7 @@ def test_all_buses_show_the_same_some_seconds_after_any_trouble(seeds: range, dr
         check_truth(world)
 
 
-@pytest.mark.parametrize(
-    "seeds", [range(10), pytest.param(range(10, 500), marks=pytest.mark.thorough)], ids=["few", "many"]
-)
+@few_or_many(3, SEEDS)
 def test_buses_with_both_settings_agree_among_themselves(seeds: range) -> None:
     for seed in seeds:
         world = World(seed)
@@ -136,9 +143,7 @@ def test_buses_with_both_settings_agree_among_themselves(seeds: range) -> None:
 
 
 @pytest.mark.parametrize("drop_lost", [False, True])
-@pytest.mark.parametrize(
-    "seeds", [range(10), pytest.param(range(10, 500), marks=pytest.mark.thorough)], ids=["few", "many"]
-)
+@few_or_many(3, SEEDS)
 def test_links_that_hear_only_some_frames_hold_exactly_these_in_the_end(seeds: range, drop_lost: bool) -> None:
     for seed in seeds:
         world = World(seed)
@@ -161,9 +166,7 @@ def test_links_that_hear_only_some_frames_hold_exactly_these_in_the_end(seeds: r
 
 
 @pytest.mark.parametrize("drop_lost", [False, True])
-@pytest.mark.parametrize(
-    "seeds", [range(10), pytest.param(range(10, 500), marks=pytest.mark.thorough)], ids=["few", "many"]
-)
+@few_or_many(3, SEEDS)
 def test_buses_behind_bridges_and_in_rings_agree(seeds: range, drop_lost: bool) -> None:
     for seed in seeds:
         world = World(seed)
@@ -182,9 +185,7 @@ def test_buses_behind_bridges_and_in_rings_agree(seeds: range, drop_lost: bool) 
 
 @pytest.mark.parametrize("drop_lost", [False, True])
 @pytest.mark.parametrize("places", PLACES.values(), ids=PLACES)
-@pytest.mark.parametrize(
-    "seeds", [range(1), pytest.param(range(1, 50), marks=pytest.mark.thorough)], ids=["few", "many"]
-)
+@few_or_many(1, SEEDS // 10)
 def test_programs_that_are_started_again_agree_after_each_of_several_troubles(
     seeds: range, places: list[list[int]], drop_lost: bool
 ) -> None:
@@ -203,10 +204,11 @@ def test_programs_that_are_started_again_agree_after_each_of_several_troubles(
 @pytest.mark.parametrize("seconds", [1.5, 7.0, 30.0])
 @pytest.mark.parametrize("trouble", ["stop", "cut", "inwards", "outwards"])
 @pytest.mark.parametrize("drop_lost", [False, True])
+@few_or_many(1, 5)
 def test_what_was_said_once_while_a_peer_was_away_arrives_soon_after(
-    trouble: str, seconds: float, drop_lost: bool
+    seeds: range, trouble: str, seconds: float, drop_lost: bool
 ) -> None:
-    for seed in range(5):
+    for seed in seeds:
         world = World(seed)
         network = Network(world)
         one, other, away = (world.process(network, drop_lost=drop_lost) for _ in range(3))
@@ -238,6 +240,28 @@ def test_what_was_said_once_while_a_peer_was_away_arrives_soon_after(
         assert agree(world.processes)
         assert {"goal", "camera"} <= away.frames.keys()
         assert "gone" not in away.frames
+
+
+@pytest.mark.parametrize("drop_lost", [False, True])
+def test_of_what_two_parted_buses_have_said_of_one_frame_the_later_holds_for_all(drop_lost: bool) -> None:
+    world = World()
+    network = Network(world)
+    # The one that speaks first was started last and has more to say, so it would have the higher numbers if buses only
+    # counted from their start.
+    other, one = (world.process(network, drop_lost=drop_lost) for _ in range(2))
+    network.cut(one.wire)
+    for stamp in range(200):
+        one.say(moving("map", "base", stamp))
+    one.say(moving("map", "goal", 1), static("map", "camera", 1.0))
+    world.run(7.0)
+    other.say(moving("map", "goal", 2), static("map", "camera", 2.0))
+    network.heal()
+    world.run(5.0)
+    late = world.process(network, drop_lost=drop_lost)
+    world.run(5.0)
+    for process in (one, other, late):
+        assert process.frames["goal"].stamp == 2
+        assert process.frames["camera"].transform.translation[0] == 2.0
 
 
 @pytest.mark.parametrize("seconds", [0.01, 60.0])

@@ -245,14 +245,14 @@ async def test_a_server_is_entered_once_with_an_entered_link_that_serves_no_othe
                 pass
 
 
-async def test_a_thousand_lookups_at_once_are_each_answered() -> None:
+async def test_hundreds_of_lookups_at_once_are_each_answered() -> None:
     async with asked() as scene, anyio.create_task_group() as tasks:
-        many = [Asked(tasks, lambda: scene.lookup("map", "base")) for _ in range(1_000)]
-        await until(lambda: scene.server.statistics().waiting == 1_000)
+        many = [Asked(tasks, lambda: scene.lookup("map", "base")) for _ in range(300)]
+        await until(lambda: scene.server.statistics().waiting == 300)
         scene.bus.publish(static("map", "base"))
         await until(lambda: all(one.ended for one in many))
         assert all(one.answer.static for one in many)
-        assert scene.counts == {"answered": 1_000}
+        assert scene.counts == {"answered": 300}
 
 
 # The time of a lookup

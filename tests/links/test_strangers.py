@@ -13,7 +13,7 @@ from support.domains import Network, Stranger, World
 from support.samples import moving, static
 
 from tfbus import PeerLost, PeerRejected, TransformStamped
-from tfbus.links.endpoint import MAX_AUTHORITIES, MAX_PEERS
+from tfbus.links.endpoint import MAX_AUTHORITIES
 from tfbus.links.message import Kind, Outgoing, read_message, write_body, write_message, write_text
 from tfbus.links.relay import LARGEST_JUMP, OutgoingBatch, RemovedFrame
 from tfbus.links.replica import MANY_ORIGINS, Claim
@@ -167,11 +167,11 @@ def test_a_number_of_this_bus_that_somebody_has_made_up_does_not_hide_what_it_sa
     scene.process.say(static("map", "s", 1.0), static("map", "t"), moving("map", "m", 1))
     scene.world.run(0.01)
     scene.told()
-    scene.say(static("map", "s", 2.0), moving("map", "m", 2), origin=scene.origin, number=500)
+    scene.say(static("map", "s", 2.0), moving("map", "m", 2), origin=scene.origin, number=10**9)
     again = {entry.samples[0].child: entry for entry in scene.told()}
     assert again["s"].samples == [static("map", "s", 1.0)]
     assert {entry.origin for entry in again.values()} == {scene.origin}
-    assert min(entry.sequence for entry in again.values()) > scene.first + 500
+    assert min(entry.sequence for entry in again.values()) > scene.first + 10**9
     scene.remove("t", origin=scene.origin, number=10**12)
     (said_again,) = scene.told()
     assert (said_again.samples, said_again.sequence > scene.first + 10**12) == ([static("map", "t")], True)
@@ -304,22 +304,6 @@ def test_batches_with_too_many_authorities_of_a_peer_are_refused_and_counted() -
             told.append(event)
     (lost,) = [event for event in told if isinstance(event, PeerLost)]
     assert (lost.link, lost.peer, lost.frames, len(lost.authorities)) == ("tf", scene.stranger.id, ("a",), 1_000)
-
-
-def test_so_many_peers_are_there_and_the_messages_of_others_are_not_taken() -> None:
-    scene = Scene()
-    others = [Stranger(scene.network, channel="") for _ in range(MAX_PEERS)]
-    scene.world.run(0.1)
-    assert len(scene.process.end.present) == MAX_PEERS
-    assert scene.rejected == {"too many peers": 1}
-    others[-1].say(others[-1].batch(static("map", "a"), number=scene.first))
-    assert scene.frames == set()
-    scene.network.remove(others[0])
-    scene.network.remove(others[-1])
-    scene.network.add(others[-1])
-    scene.world.run(0.1)
-    others[-1].say(others[-1].batch(static("map", "a"), number=scene.first))
-    assert scene.frames == {"a"}
 
 
 def test_nothing_is_taken_of_a_link_that_was_not_announced_or_has_gone() -> None:

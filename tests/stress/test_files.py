@@ -30,6 +30,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "bare.mcap": {"use_statistics": False, "repeat_channels": False, "enable_crcs": False},
 }
 """The layouts of an MCAP file."""
+STEP, DAMAGES = (int(os.environ.get(name, default)) for name, default in (("FILE_STEP", "7"), ("FILE_DAMAGES", "60")))
+"""A file is cut at every so many bytes, and damaged so many times, in the thorough suite."""
 
 
 def zstd(path: Path) -> Path:
@@ -53,7 +55,7 @@ def finished_file(kind: str, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", [*OPTIONS, "bag", "db3", "mcap.zstd", "db3.zstd"])
-@pytest.mark.parametrize("step", [97, pytest.param(1, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("step", [97, pytest.param(STEP, marks=pytest.mark.thorough)])
 def test_a_finished_file_that_is_cut_anywhere_tells_of_it(tmp_path: Path, kind: str, step: int) -> None:
     path = finished_file(kind, tmp_path)
     data = path.read_bytes()
@@ -95,7 +97,7 @@ def mutated(data: bytes, numbers: random.Random) -> bytes:
 
 
 @pytest.mark.parametrize("kind", [*OPTIONS, "bag", "db3", "mcap.zstd", "metadata.yaml"])
-@pytest.mark.parametrize("count", [5, pytest.param(200, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("count", [5, pytest.param(DAMAGES, marks=pytest.mark.thorough)])
 def test_a_damaged_file_is_read_or_refused_and_nothing_else(tmp_path: Path, kind: str, count: int) -> None:
     if kind == "metadata.yaml":
         recording = as_ros2(SMALL, tmp_path / "folder", StoragePlugin.MCAP)

@@ -13,8 +13,8 @@ import pytest
 from support.fault_world import OneMachine, Routers, hosts, short_directory
 from support.processes import Crowd, crowd
 
-FIRST, LAST = (int(seed) for seed in os.environ.get("FAULT_SEEDS", "1 2").split())
-SECONDS = float(os.environ.get("FAULT_SECONDS", "40"))
+FIRST, LAST = (int(seed) for seed in os.environ.get("FAULT_SEEDS", "1 1").split())
+SECONDS = float(os.environ.get("FAULT_SECONDS", "15"))
 SEEDS = range(FIRST, LAST + 1)
 DROP_LOST = pytest.mark.parametrize("drop_lost", [False, True], ids=["kept", "dropped"])
 
@@ -36,13 +36,6 @@ def tell(capsys: pytest.CaptureFixture[str], line: str) -> None:
         print(f"\n{line}")
 
 
-@pytest.mark.parametrize("drop_lost", [pytest.param(False, marks=pytest.mark.thorough), True])
-def test_a_few_faults_on_one_machine_leave_all_buses_equal(processes: Crowd, directory: Path, drop_lost: bool) -> None:
-    world = OneMachine(processes, 0, drop_lost, directory)
-    world.longest_pauses = 2
-    world.run(rounds=3)
-
-
 @pytest.mark.thorough
 @DROP_LOST
 @pytest.mark.parametrize("seed", SEEDS)
@@ -56,6 +49,7 @@ def test_all_buses_of_one_machine_are_equal_after_each_fault(
 @pytest.mark.thorough
 def test_a_few_faults_of_a_router_leave_all_buses_equal(processes: Crowd) -> None:
     pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
+    # Without network namespaces, which the others need.
     with Routers(processes, 0, drop_lost=False, routers=1, apart=None) as world:
         world.longest_pauses = 2
         world.run(rounds=2)

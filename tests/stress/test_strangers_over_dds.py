@@ -16,7 +16,11 @@ from tfbus import Bus, SimulatedClock
 from tfbus.links.dds import DdsLink
 from tfbus.links.dds.dds_link import configuration
 
-pytestmark = [pytest.mark.anyio, pytest.mark.thorough]
+pytestmark = [
+    pytest.mark.anyio,
+    pytest.mark.thorough,
+    pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"]),
+]
 
 PEER = Path(__file__).with_name("hostile_cyclone_peer.py")
 SUPPORT = Path(__file__).parents[1] / "support"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import moving, static
 
@@ -57,7 +57,6 @@ stamp_sets = st.sets(st.integers(-30, 30), max_size=8)
 policies = st.builds(Policy, st.integers(0, 12), st.none() | st.integers(0, 20), st.integers(0, 25))
 
 
-@settings(max_examples=100)
 @given(stamp_sets, policies)
 def test_the_stamp_read_for_a_question_follows_the_rule(stamps: set[int], policy: Policy) -> None:
     edge = history(sorted(stamps))

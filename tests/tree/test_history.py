@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import held
 
@@ -57,7 +57,6 @@ def test_samples_between_have_their_authorities_as_long_as_there_are_several_in_
 STAMPS = st.integers(0, 20)
 
 
-@settings(max_examples=100)
 @given(st.lists(st.tuples(STAMPS, st.sampled_from("abc")), min_size=1), st.none() | st.integers(0, 12))
 def test_each_stamp_has_the_name_that_a_plain_dict_of_all_samples_gives_it(
     samples: list[tuple[int, str]], keep: int | None

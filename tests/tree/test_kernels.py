@@ -312,7 +312,7 @@ def test_out_of_memory_in_a_commit_leaves_every_history_as_it_was(without_lock: 
     assert COMPILED is not None
     whole = answers_of(COMPILED, threading.Lock()) if without_lock else None
     failures = 0
-    for allowed in range(40):
+    for allowed in range(100):
         frames = {name: history(COMPILED, [(stamp, x(stamp)) for stamp in range(8)], keep=9) for name in "ab"}
         before = [contents(edge) for edge in frames.values()]
         # The fourth sample of an edge finds its memory full, whatever its size was.
@@ -328,7 +328,7 @@ def test_out_of_memory_in_a_commit_leaves_every_history_as_it_was(without_lock: 
             failures += 1
             assert [contents(edge) for edge in frames.values()] == before
             assert COMPILED.commit(frames, batch, 0) == 200
-    assert 0 < failures < 40
+    assert 0 < failures < 100
 
 
 def answers_of(kernel: Any, lock: Any) -> Any:
@@ -517,8 +517,6 @@ def test_samples_are_copied_and_pickled_with_all_that_they_hold(again: type) -> 
     assert type(again(tree.lookup("a", "b", LATEST))) is TransformStamped
 
 
-"""The number of random trees in the thorough suite."""
-
 SHOW = """
 from tfbus import TransformStamped
 from tfbus.which_kernel import kernel
@@ -544,7 +542,7 @@ WITHOUT = "import sys; sys.modules['tfbus._kernel'] = None\n"
 
 
 @needs_both
-@pytest.mark.parametrize("wanted", [None, "", "compiled"])
+@pytest.mark.parametrize("wanted", ["", "compiled"])
 def test_the_compiled_kernel_runs_where_it_was_built(wanted: str | None) -> None:
     assert run(wanted).stdout.split() == ["compiled", "tfbus._kernel"]
 

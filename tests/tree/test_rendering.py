@@ -198,7 +198,7 @@ def test_yaml_round_trips_every_name(parent: str, child: str, authority: str) ->
     assert (facts["parent"], facts["broadcaster"]) == (parent, authority)
 
 
-@pytest.mark.parametrize("length", [1, 1_000, 1_020, 1_021, 1_022, 1_023, 1_024, 1_025, 1_026, 5_000, 100_000])
+@pytest.mark.parametrize("length", [1, 1_000, *range(1_020, 1_027), pytest.param(100_000, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("letter", ["a", "é", "\u202e", "\U000e0001", "\\"])
 def test_pyyaml_reads_names_of_any_length_back(letter: str, length: int) -> None:
     yaml: Any = pytest.importorskip("yaml")

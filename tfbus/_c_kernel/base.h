@@ -35,13 +35,14 @@ enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quat
 #define ROW_SIZE (WIDTH * sizeof(double))
 #define SAMPLE_SIZE (sizeof(int64_t) + ROW_SIZE)
 #define ROUNDING 1e-15 /* as in tfbus.rows */
+#define NORM_TOLERANCE 0.01 /* as in tfbus.rows */
 #define EXACT_GAP ((uint64_t)1 << 53) /* ns; a greater difference of stamps is inexact as a float, and Python divides */
 
-static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
+static PyTypeObject *ColumnsType, *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
 static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType, *MethodType;
 static PyObject *empty_string, *raise_string, *drop_string, *at_string, *paths_string, *memory_string;
 static PyObject *bound_method; /* types.MethodType */
-static PyObject *array_type;   /* numpy.ndarray */
+static PyObject *array_type;   /* numpy.ndarray; NULL until somebody asks with an array */
 
 static const double identity[WIDTH] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0};
 
@@ -92,6 +93,15 @@ let_go_of(PyObject *self)
     PyTypeObject *type = Py_TYPE(self);
     ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
     Py_DECREF(type);
+}
+
+static PyObject *
+imported(const char *module, const char *name)
+{
+    PyObject *found = PyImport_ImportModule(module);
+    PyObject *value = found == NULL ? NULL : PyObject_GetAttrString(found, name);
+    Py_XDECREF(found);
+    return value;
 }
 
 /* Whether a call has no keyword arguments; else there is an error. */

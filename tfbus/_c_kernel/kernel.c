@@ -26,6 +26,9 @@ static PyMethodDef module_methods[] = {
     {"decode", FAST(decode), METH_FASTCALL,
      PyDoc_STR("decode(body, at, tags, names, kind): the samples of a message up to the first that is not plain, and "
                "its offset.")},
+    {"columns", FAST(columns), METH_FASTCALL,
+     PyDoc_STR("columns(parents, children, stamps, rows, authority, static, square): the rows as a batch, or None if one "
+               "is not plain. They are normalised in place.")},
     {"commit", FAST(commit), METH_FASTCALL,
      PyDoc_STR("commit(frames, batch, first): store the samples from `first` to the first that is not plain; its "
                "index.")},
@@ -39,15 +42,6 @@ add_type(PyObject *module, const char *name, PyType_Spec *spec, PyTypeObject **t
         return -1;
     }
     return PyModule_AddObjectRef(module, name, (PyObject *)*type);
-}
-
-static PyObject *
-imported(const char *module, const char *name)
-{
-    PyObject *found = PyImport_ImportModule(module);
-    PyObject *value = found == NULL ? NULL : PyObject_GetAttrString(found, name);
-    Py_XDECREF(found);
-    return value;
 }
 
 static int
@@ -68,11 +62,11 @@ module_exec(PyObject *module)
             return -1;
         }
     }
-    if ((bound_method == NULL && (bound_method = imported("types", "MethodType")) == NULL)
-        || (array_type == NULL && (array_type = imported("numpy", "ndarray")) == NULL)) {
+    if (bound_method == NULL && (bound_method = imported("types", "MethodType")) == NULL) {
         return -1;
     }
     if (add_type(module, "Sample", &sample_spec, &SampleType) < 0
+        || add_type(module, "Columns", &columns_spec, &ColumnsType) < 0
         || add_type(module, "Block", &block_spec, &BlockType) < 0
         || add_type(module, "History", &history_spec, &HistoryType) < 0
         || add_type(module, "Chain", &chain_spec, &ChainType) < 0

@@ -648,6 +648,10 @@ room_for_rows(PyObject *stamps)
     if (is_list || is_tuple) {
         count = is_list ? PyList_Size(stamps) : PyTuple_Size(stamps);
     } else {
+        /* Not when the kernel is loaded, because `tfbus --version` does without numpy. */
+        if (array_type == NULL && (array_type = imported("numpy", "ndarray")) == NULL) {
+            return NULL;
+        }
         /* Python judges arrays with a mask. */
         if (OBJECT(Py_TYPE(stamps)) != array_type
             && (!PyObject_CheckBuffer(stamps) || PyObject_HasAttrString(stamps, "mask"))) {
@@ -729,8 +733,8 @@ paths_answer_many(Paths *self, PyObject *const *args, Py_ssize_t nargs)
 static PyObject *
 paths_commit(Paths *self, PyObject *const *args, Py_ssize_t nargs)
 {
-    if (nargs != 3 || !PyDict_Check(args[0]) || !PyDict_Check(args[1]) || !PyTuple_CheckExact(args[2])) {
-        PyErr_SetString(PyExc_TypeError, "commit takes a dict of histories, a dict of readers and a tuple of samples");
+    if (nargs != 3 || !PyDict_Check(args[0]) || !PyDict_Check(args[1]) || !is_batch(args[2])) {
+        PyErr_SetString(PyExc_TypeError, "commit takes a dict of histories, a dict of readers and a batch");
         return NULL;
     }
     if (self->recent == NULL || PyDict_Size(args[1]) > 0) {
@@ -740,7 +744,7 @@ paths_commit(Paths *self, PyObject *const *args, Py_ssize_t nargs)
     if (free < 0) {
         return NULL;
     }
-    const Py_ssize_t size = PyTuple_Size(args[2]);
+    const Py_ssize_t size = batch_size(args[2]);
     const Py_ssize_t end = free ? store(args[0], args[2], 0, 1) : 0;
     if (end < 0) {
         return NULL;

@@ -165,24 +165,24 @@ judge_allow(Judge *self, PyObject *args)
 static PyObject *
 judge_accepts(Judge *self, PyObject *batch)
 {
-    if (!PyTuple_CheckExact(batch)) {
-        PyErr_SetString(PyExc_TypeError, "a batch is a tuple of samples");
+    if (!is_batch(batch)) {
+        PyErr_SetString(PyExc_TypeError, "a batch is a tuple of samples, or columns");
         return NULL;
     }
     if (self->until != INT64_MAX && elapsed() >= self->until) {
         Py_RETURN_FALSE;
     }
-    const Py_ssize_t size = PyTuple_Size(batch);
+    const Py_ssize_t size = batch_size(batch);
+    Sample scratch;
     Edge *few[FEW], **edges = few;
     if (size > FEW && (edges = PyMem_Malloc((size_t)size * sizeof(Edge *))) == NULL) {
         return PyErr_NoMemory();
     }
     Py_ssize_t judged = 0;
+    PyObject *child = NULL;
     for (; self->edges != NULL && judged < size; judged++) {
-        PyObject *item = PyTuple_GetItem(batch, judged);
-        const Sample *sample = (const Sample *)item;
-        if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL || sample->is_static
-            || sample->stamp > self->horizon) {
+        const Sample *sample = sample_at(batch, judged, &scratch);
+        if (sample == NULL || sample->is_static || sample->stamp > self->horizon) {
             break;
         }
         const double *row = sample->row;
@@ -190,11 +190,16 @@ judge_accepts(Judge *self, PyObject *batch)
         if (!(row[0] * row[0] + row[1] * row[1] + row[2] * row[2] <= self->square)) {
             break;
         }
-        PyObject *known = PyDict_GetItemWithError(self->edges, sample->child);
-        if (known == NULL || !PyObject_TypeCheck(known, EdgeType)) {
-            break;
+        if (judged > 0 && sample->child == child) {
+            edges[judged] = edges[judged - 1];
+        } else {
+            PyObject *known = PyDict_GetItemWithError(self->edges, sample->child);
+            if (known == NULL || !PyObject_TypeCheck(known, EdgeType)) {
+                break;
+            }
+            edges[judged] = (Edge *)known;
+            child = sample->child;
         }
-        edges[judged] = (Edge *)known;
         if (!same_string(sample->parent, edges[judged]->parent)
             || !same_string(sample->authority, edges[judged]->trusted)
             || (sample->stamp < self->earliest && !edges[judged]->late)) {
@@ -205,7 +210,7 @@ judge_accepts(Judge *self, PyObject *batch)
     const int64_t earliest = self->earliest;
     long long behind = 0;
     for (Py_ssize_t i = 0; plain && i < size; i++) {
-        const int64_t stamp = ((const Sample *)PyTuple_GetItem(batch, i))->stamp;
+        const int64_t stamp = sample_at(batch, i, &scratch)->stamp;
         if (!edges[i]->has_newest || stamp > edges[i]->newest) {
             edges[i]->newest = stamp;
             edges[i]->has_newest = 1;
@@ -305,6 +310,9 @@ intake_batch(const Intake *self, PyObject *samples)
         return PyTuple_Pack(1, samples);
     }
     PyObject *batch = NULL;
+    if (OBJECT(Py_TYPE(samples)) == OBJECT(ColumnsType) && batch_size(samples) > 0) {
+        return Py_NewRef(samples);
+    }
     if (PyList_CheckExact(samples)) {
         batch = PyList_AsTuple(samples);
     } else if (PyTuple_CheckExact(samples)) {
@@ -358,7 +366,7 @@ intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
         }
         return accepted;
     }
-    self->samples += PyTuple_Size(batch);
+    self->samples += batch_size(batch);
     PyObject *feeds = self->feeds;
     Py_INCREF(feeds);
     const Py_ssize_t count = PyTuple_Size(feeds);
@@ -368,7 +376,9 @@ intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
         PyObject *pair = PyTuple_GetItem(feeds, i), *done = feed_insert((Feed *)PyTuple_GetItem(pair, 0), batch);
         if (done == Py_False) {
             Py_DECREF(done);
-            done = PyObject_CallFunctionObjArgs(PyTuple_GetItem(pair, 1), batch, NULL);
+            PyObject *objects = PyTuple_CheckExact(batch) ? Py_NewRef(batch) : columns_samples(batch, self->kind);
+            done = objects == NULL ? NULL : PyObject_CallFunctionObjArgs(PyTuple_GetItem(pair, 1), objects, NULL);
+            Py_XDECREF(objects);
         }
         if (done == NULL) {
             set_aside(&trouble);

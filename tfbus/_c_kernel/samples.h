@@ -173,37 +173,262 @@ static PyType_Spec sample_spec = {
     "tfbus._kernel.Sample", sizeof(Sample), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, sample_slots
 };
 
+/* Batches: tuples of samples, or columns ----------------------------------------------------------------------------- */
+
+/* Rows of numbers that can be samples. The objects are made only if somebody needs them. */
+typedef struct {
+    PyObject_HEAD
+    PyObject *parents, *children; /* a plain str for all rows, or a tuple of these */
+    PyObject *authority;          /* a plain str */
+    Py_buffer buffers[2];         /* the stamps, and seven floats a row; both have memory, or none */
+    Py_ssize_t count;
+    char is_static;
+} Columns;
+
+static int
+same_string(PyObject *a, PyObject *b)
+{
+    return a == b || (a != NULL && b != NULL && PyUnicode_Compare(a, b) == 0);
+}
+
+static Py_ssize_t
+batch_size(PyObject *batch)
+{
+    return PyTuple_CheckExact(batch) ? PyTuple_Size(batch) : ((Columns *)batch)->count;
+}
+
+static int
+is_batch(PyObject *value)
+{
+    return PyTuple_CheckExact(value) || OBJECT(Py_TYPE(value)) == OBJECT(ColumnsType);
+}
+
+static PyObject *
+name_at(PyObject *names, Py_ssize_t row)
+{
+    return PyUnicode_CheckExact(names) ? names : PyTuple_GetItem(names, row);
+}
+
+/* A sample of a batch; one of columns is in `scratch`, and borrows its names. NULL for another object in a tuple. */
+static inline const Sample *
+sample_at(PyObject *batch, Py_ssize_t i, Sample *scratch)
+{
+    if (PyTuple_CheckExact(batch)) {
+        PyObject *item = PyTuple_GetItem(batch, i);
+        return PyObject_TypeCheck(item, SampleType) && ((Sample *)item)->authority != NULL ? (Sample *)item : NULL;
+    }
+    const Columns *columns = (const Columns *)batch;
+    scratch->parent = name_at(columns->parents, i);
+    scratch->child = name_at(columns->children, i);
+    scratch->authority = columns->authority;
+    scratch->stamp = ((const int64_t *)columns->buffers[0].buf)[i];
+    memcpy(scratch->row, (const double *)columns->buffers[1].buf + WIDTH * i, ROW_SIZE);
+    scratch->is_static = columns->is_static;
+    return scratch;
+}
+
+/* Whether a row is finite, its quaternion within a hundredth of a unit one, and the square of its translation at most
+ * `square`. Then the quaternion is normalised: tfbus.rows.as_rotation. */
+static int
+make_rigid(double *row, double square)
+{
+    const double norm_square = row[3] * row[3] + row[4] * row[4] + row[5] * row[5] + row[6] * row[6];
+    /* Not `>`, which is false for NaN. */
+    if (!(fabs(norm_square - 1.0) <= ROUNDING)) {
+        const double norm = sqrt(norm_square);
+        if (!(fabs(norm - 1.0) <= NORM_TOLERANCE)) {
+            return 0;
+        }
+        for (int k = 3; k < WIDTH; k++) {
+            row[k] /= norm;
+        }
+    }
+    return row[0] * row[0] + row[1] * row[1] + row[2] * row[2] <= square;
+}
+
+static int
+names_a_frame(PyObject *name)
+{
+    return PyUnicode_CheckExact(name) && PyUnicode_GetLength(name) > 0 && PyUnicode_ReadChar(name, 0) != '/';
+}
+
+/* Whether all rows are plain; -1 for an error. */
+static int
+columns_are_plain(Columns *self, double square)
+{
+    PyObject *parent = NULL, *child = NULL;
+    for (Py_ssize_t i = 0; i < self->count; i++) {
+        PyObject *above = name_at(self->parents, i), *below = name_at(self->children, i);
+        if ((above != parent || below != child)
+            && (!names_a_frame(above) || !names_a_frame(below) || same_string(above, below))) {
+            return 0;
+        }
+        parent = above;
+        child = below;
+        if (!make_rigid((double *)self->buffers[1].buf + WIDTH * i, square)) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+static int
+fits(PyObject *names, Py_ssize_t count)
+{
+    return PyUnicode_CheckExact(names) || (PyTuple_CheckExact(names) && PyTuple_Size(names) == count);
+}
+
+/* columns(parents, children, stamps, rows, authority, static, square) */
+static PyObject *
+columns(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 7 || !PyUnicode_CheckExact(args[4])) {
+        PyErr_SetString(PyExc_TypeError, "columns takes parents, children, stamps, rows, an authority, whether they are "
+                                         "static, and the greatest square");
+        return NULL;
+    }
+    const int is_static = PyObject_IsTrue(args[5]);
+    const double square = PyFloat_AsDouble(args[6]);
+    Columns *self = PyErr_Occurred() ? NULL : (Columns *)PyType_GenericAlloc(ColumnsType, 0);
+    if (self == NULL || !open_buffers(args + 2, 2, self->buffers, PyBUF_SIMPLE, PyBUF_WRITABLE)) {
+        Py_XDECREF(OBJECT(self));
+        return NULL;
+    }
+    self->count = self->buffers[0].len / (Py_ssize_t)sizeof(int64_t);
+    self->parents = Py_NewRef(args[0]);
+    self->children = Py_NewRef(args[1]);
+    self->authority = Py_NewRef(args[4]);
+    self->is_static = (char)is_static;
+    if (self->buffers[1].len != self->count * (Py_ssize_t)ROW_SIZE || !fits(args[0], self->count)
+        || !fits(args[1], self->count)) {
+        PyErr_SetString(PyExc_ValueError, "each row needs two names, a stamp and seven floats");
+        Py_DECREF(OBJECT(self));
+        return NULL;
+    }
+    if (columns_are_plain(self, square)) {
+        return OBJECT(self);
+    }
+    Py_DECREF(OBJECT(self));
+    Py_RETURN_NONE;
+}
+
+/* The samples as a tuple of objects. */
+static PyObject *
+columns_samples(PyObject *self, PyObject *kind)
+{
+    if (!PyType_Check(kind) || !PyType_IsSubtype((PyTypeObject *)kind, SampleType)) {
+        PyErr_SetString(PyExc_TypeError, "samples takes a type of samples");
+        return NULL;
+    }
+    const Py_ssize_t count = ((Columns *)self)->count;
+    PyObject *samples = PyTuple_New(count);
+    for (Py_ssize_t i = 0; samples != NULL && i < count; i++) {
+        Sample scratch, *sample = (Sample *)PyType_GenericAlloc((PyTypeObject *)kind, 0);
+        if (sample == NULL) {
+            Py_CLEAR(samples);
+            break;
+        }
+        sample_at(self, i, &scratch);
+        sample->parent = Py_NewRef(scratch.parent);
+        sample->child = Py_NewRef(scratch.child);
+        sample->authority = Py_NewRef(scratch.authority);
+        sample->stamp = scratch.stamp;
+        memcpy(sample->row, scratch.row, ROW_SIZE);
+        sample->is_static = scratch.is_static;
+        if (PyTuple_SetItem(samples, i, OBJECT(sample)) < 0) {
+            Py_CLEAR(samples);
+        }
+    }
+    return samples;
+}
+
+static Py_ssize_t
+columns_length(PyObject *self)
+{
+    return ((Columns *)self)->count;
+}
+
+static void
+columns_dealloc(Columns *self)
+{
+    close_buffers(self->buffers);
+    Py_XDECREF(self->parents);
+    Py_XDECREF(self->children);
+    Py_XDECREF(self->authority);
+    let_go_of(OBJECT(self));
+}
+
+static PyMethodDef columns_methods[] = {
+    {"samples", (PyCFunction)columns_samples, METH_O, PyDoc_STR("samples(kind): the rows as a tuple of samples.")},
+    {NULL}
+};
+
+static PyType_Slot columns_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("Rows of numbers that can be samples.")},
+    {Py_tp_dealloc, columns_dealloc},
+    {Py_tp_methods, columns_methods},
+    {Py_sq_length, columns_length},
+    {0, NULL}
+};
+
+static PyType_Spec columns_spec = {
+    "tfbus._kernel.Columns", sizeof(Columns), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION | Py_TPFLAGS_IMMUTABLETYPE, columns_slots
+};
+
 /* Block: the memory of a history ----------------------------------------------------------------------------------- */
 
 /* The stamps of all samples, then their rows. A reader reads the samples that the block had when the reading began.
  * While a block has readers, its history only appends samples, and takes another block for every other change. */
 typedef struct {
-    PyObject_VAR_HEAD
+    PyObject_HEAD
     Py_ssize_t readers; /* how many read it besides its history */
+    Py_ssize_t capacity;
+    void *memory;
 } Block;
 
 static int64_t *
 block_stamps(const Block *block)
 {
-    return (int64_t *)((char *)block + sizeof(Block));
+    return block->memory;
 }
 
 static double *
 block_rows(const Block *block)
 {
-    return (double *)(block_stamps(block) + Py_SIZE((PyObject *)block));
+    return (double *)(block_stamps(block) + block->capacity);
 }
 
-static Py_ssize_t
-block_capacity(const Block *block)
+static Block *
+block_new(Py_ssize_t capacity)
 {
-    return Py_SIZE((PyObject *)block);
+    Block *block = (Block *)PyType_GenericAlloc(BlockType, 0);
+    if (block == NULL) {
+        return NULL;
+    }
+    /* Not zeroed: the system gives a large block page by page, when it is written to. */
+    block->memory = PyMem_Malloc((size_t)capacity * SAMPLE_SIZE);
+    block->capacity = capacity;
+    if (block->memory == NULL) {
+        Py_DECREF(OBJECT(block));
+        PyErr_NoMemory();
+        return NULL;
+    }
+    return block;
+}
+
+/* Copy some samples from one block to a place in another. */
+static void
+block_copy(const Block *from, Py_ssize_t first, Py_ssize_t count, Block *to, Py_ssize_t place)
+{
+    memcpy(block_stamps(to) + place, block_stamps(from) + first, (size_t)count * sizeof(int64_t));
+    memcpy(block_rows(to) + WIDTH * place, block_rows(from) + WIDTH * first, (size_t)count * ROW_SIZE);
 }
 
 static int
 block_getbuffer(Block *self, Py_buffer *view, int flags)
 {
-    const Py_ssize_t size = block_capacity(self) * (Py_ssize_t)SAMPLE_SIZE;
+    const Py_ssize_t size = self->capacity * (Py_ssize_t)SAMPLE_SIZE;
     if (PyBuffer_FillInfo(view, (PyObject *)self, block_stamps(self), size, 1, flags) < 0) {
         return -1;
     }
@@ -220,6 +445,7 @@ block_releasebuffer(Block *self, Py_buffer *Py_UNUSED(view))
 static void
 block_dealloc(PyObject *self)
 {
+    PyMem_Free(((Block *)self)->memory);
     let_go_of(OBJECT(self));
 }
 
@@ -232,7 +458,7 @@ static PyType_Slot block_slots[] = {
 };
 
 static PyType_Spec block_spec = {
-    "tfbus._kernel.Block", sizeof(Block), (int)SAMPLE_SIZE,
+    "tfbus._kernel.Block", sizeof(Block), 0,
     Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION | Py_TPFLAGS_IMMUTABLETYPE, block_slots
 };
 
@@ -243,6 +469,9 @@ typedef struct {
     PyObject *parent, *authority; /* plain str, of the newest sample */
     Block *block;                 /* NULL until there is a sample */
     Py_ssize_t start, end;        /* the samples in the window */
+    Block *next;                  /* the block that it moves into, or NULL */
+    Py_ssize_t from, moved;       /* the place of the first sample of `next` in `block`, and how many it has */
+    Block *left;                  /* the block that it has moved out of, while its memory is given back, or NULL */
     int64_t keep;                 /* ns; -1 for ever */
     char mixed;                   /* whether the samples name several parents */
 } History;
@@ -285,6 +514,102 @@ lower_bound(const int64_t *stamps, Py_ssize_t count, int64_t at)
     return low + (count == 1 && stamps[low] < at);
 }
 
+/* A history of many samples that is about to need another block moves there bit by bit, a few samples with each new
+ * one, and gives the memory of the old block back bit by bit too. All at once, either would hold up the event loop. It
+ * has moved long before the present block is full. A change that is not an append ends the move; it begins anew. */
+enum {
+    MANY = 1 << 14,   /* a history of fewer samples moves at once */
+    BIT = 16,         /* samples that move with each new one */
+    GIVEN = 1 << 12,  /* samples whose memory is given back at once, */
+    GIVEN_EACH = 64   /* with each so many new ones */
+};
+
+/* The capacity of a block for some samples. To copy many more seldom, many get more room, which costs no memory until
+ * it is used. */
+static Py_ssize_t
+capacity_for(Py_ssize_t count)
+{
+    return count + (count < MANY ? count / 8 : count / 2) + 7;
+}
+
+/* Change the block for another one or NULL, where the sample at `place` is the first. */
+static void
+history_change_block(History *self, Block *block, Py_ssize_t place)
+{
+    Block *old[] = {self->block, self->next == block ? NULL : self->next, self->left};
+    self->block = block;
+    self->next = self->left = NULL;
+    self->start -= place;
+    self->end -= place;
+    for (int i = 0; i < 3; i++) {
+        Py_XDECREF(OBJECT(old[i]));
+    }
+}
+
+static void
+history_stop_moving(History *self)
+{
+    Block *next = self->next;
+    self->next = NULL;
+    Py_XDECREF(OBJECT(next));
+}
+
+static void
+history_give_back(History *self)
+{
+    Block *left = self->left;
+    if (self->end % GIVEN_EACH != 0) {
+        return;
+    }
+    if (left->readers == 0 && left->capacity > MANY) {
+        const Py_ssize_t capacity = left->capacity - GIVEN;
+        void *memory = PyMem_Realloc(left->memory, (size_t)capacity * SAMPLE_SIZE);
+        if (memory != NULL) {
+            left->memory = memory;
+            left->capacity = capacity;
+            return;
+        }
+    }
+    self->left = NULL;
+    Py_DECREF(OBJECT(left));
+}
+
+static void
+history_move(History *self)
+{
+    const Py_ssize_t count = self->end - self->start;
+    if (self->left != NULL) {
+        history_give_back(self);
+    }
+    if (self->next == NULL) {
+        if (self->block->capacity - self->end > count / 8) {
+            return;
+        }
+        self->next = block_new(capacity_for(count));
+        self->from = self->start;
+        self->moved = 0;
+        if (self->next == NULL) {
+            PyErr_Clear();
+            return;
+        }
+    }
+    Py_ssize_t some = self->end - self->from - self->moved;
+    if (some < 0) {
+        /* The last samples were taken back. */
+        self->moved += some;
+        some = 0;
+    }
+    some = some < BIT ? some : BIT;
+    block_copy(self->block, self->from + self->moved, some, self->next, self->moved);
+    self->moved += some;
+    if (self->from + self->moved == self->end) {
+        Block *left = self->block;
+        Py_INCREF(OBJECT(left));
+        history_change_block(self, self->next, self->from);
+        self->left = left;
+    }
+}
+
 /* Put the samples in the window into a block of its own, at the front, with room for `more`, and some beyond. */
 static int
 history_rehouse(History *self, Py_ssize_t more)
@@ -295,19 +620,14 @@ history_rehouse(History *self, Py_ssize_t more)
         PyErr_NoMemory();
         return -1;
     }
-    Block *block = (Block *)PyType_GenericAlloc(BlockType, count + more + (count + more) / 8 + 7);
+    Block *block = block_new(capacity_for(count + more));
     if (block == NULL) {
         return -1;
     }
     if (count > 0) {
-        memcpy(block_stamps(block), block_stamps(self->block) + self->start, count * sizeof(int64_t));
-        memcpy(block_rows(block), block_rows(self->block) + WIDTH * self->start, count * ROW_SIZE);
+        block_copy(self->block, self->start, count, block, 0);
     }
-    Block *old = self->block;
-    self->block = block;
-    self->start = 0;
-    self->end = count;
-    Py_XDECREF(OBJECT(old));
+    history_change_block(self, block, self->start);
     return 0;
 }
 
@@ -315,13 +635,14 @@ history_rehouse(History *self, Py_ssize_t more)
 static int
 history_reserve(History *self, Py_ssize_t more)
 {
-    if (self->block != NULL && more <= block_capacity(self->block) - self->end) {
+    if (self->block != NULL && more <= self->block->capacity - self->end) {
         return 0;
     }
     const Py_ssize_t count = self->end - self->start;
     /* In place, if nobody else reads the block and the move pays off. */
     if (self->block != NULL && self->block->readers == 0 && self->start > count / 8
-        && more <= block_capacity(self->block) - count && block_capacity(self->block) <= 2 * count + 16) {
+        && more <= self->block->capacity - count && self->block->capacity <= 2 * count + 16) {
+        history_stop_moving(self);
         memmove(block_stamps(self->block), block_stamps(self->block) + self->start, count * sizeof(int64_t));
         memmove(block_rows(self->block), block_rows(self->block) + WIDTH * self->start, count * ROW_SIZE);
         self->start = 0;
@@ -334,6 +655,9 @@ history_reserve(History *self, Py_ssize_t more)
 static int
 history_push(History *self, int64_t stamp, const double *row)
 {
+    if (self->end - self->start >= MANY) {
+        history_move(self);
+    }
     if (history_reserve(self, 1) < 0) {
         return -1;
     }
@@ -352,12 +676,6 @@ history_slide(History *self)
     while (stamps[self->start] < horizon) {
         self->start++;
     }
-}
-
-static int
-same_string(PyObject *a, PyObject *b)
-{
-    return a == b || (a != NULL && b != NULL && PyUnicode_Compare(a, b) == 0);
 }
 
 /* Whether a sample only continues a history. All strings are plain ones. */
@@ -382,15 +700,15 @@ history_init(History *self, PyObject *args, PyObject *kwargs)
     if ((parent = plain_string(parent)) == NULL) {
         return -1;
     }
-    PyObject *old[] = {self->parent, self->authority, (PyObject *)self->block};
+    PyObject *old[] = {self->parent, self->authority};
     self->parent = parent;
     Py_INCREF(empty_string);
     self->authority = empty_string;
-    self->block = NULL;
+    history_change_block(self, NULL, 0);
     self->start = self->end = 0;
     self->keep = window;
     self->mixed = 0;
-    for (int i = 0; i < 3; i++) {
+    for (int i = 0; i < 2; i++) {
         Py_XDECREF(old[i]);
     }
     return 0;
@@ -589,6 +907,7 @@ history_put(History *self, PyObject *const *args, Py_ssize_t count)
     if (self->block->readers > 0 && history_rehouse(self, 1) < 0) {
         return NULL;
     }
+    history_stop_moving(self);
     /* It may have been moved. */
     place = self->start + index;
     const Py_ssize_t behind = self->end - place;
@@ -607,10 +926,8 @@ history_put(History *self, PyObject *const *args, Py_ssize_t count)
 static PyObject *
 history_clear(History *self, PyObject *Py_UNUSED(ignored))
 {
-    Block *old = self->block;
-    self->block = NULL;
+    history_change_block(self, NULL, 0);
     self->start = self->end = 0;
-    Py_XDECREF(OBJECT(old));
     Py_RETURN_NONE;
 }
 
@@ -625,20 +942,17 @@ history_take(History *self, PyObject *other)
     if (other == (PyObject *)self) {
         Py_RETURN_NONE;
     }
-    Block *old = self->block;
-    const Py_ssize_t start = self->start, end = self->end;
-    Py_XINCREF(OBJECT(from->block));
-    self->block = from->block;
-    self->start = from->start;
-    self->end = from->end;
-    if (history_rehouse(self, 1) < 0) {
-        Py_XDECREF(OBJECT(self->block));
-        self->block = old;
-        self->start = start;
-        self->end = end;
+    const Py_ssize_t count = from->end - from->start;
+    Block *block = block_new(capacity_for(count + 1));
+    if (block == NULL) {
         return NULL;
     }
-    Py_XDECREF(OBJECT(old));
+    if (count > 0) {
+        block_copy(from->block, from->start, count, block, 0);
+    }
+    history_change_block(self, block, 0);
+    self->start = 0;
+    self->end = count;
     Py_RETURN_NONE;
 }
 
@@ -662,7 +976,7 @@ history_columns(History *self, PyObject *const *args, Py_ssize_t nargs)
     }
     Block *block = self->block;
     const Py_ssize_t at = self->start + first;
-    const Py_ssize_t rows = (Py_ssize_t)sizeof(int64_t) * block_capacity(block) + (Py_ssize_t)ROW_SIZE * at;
+    const Py_ssize_t rows = (Py_ssize_t)sizeof(int64_t) * block->capacity + (Py_ssize_t)ROW_SIZE * at;
     /* Making the view may run Python code, by the garbage collector. */
     Py_INCREF(OBJECT(block));
     block->readers++;
@@ -756,7 +1070,7 @@ history_dealloc(History *self)
 {
     Py_XDECREF(self->parent);
     Py_XDECREF(self->authority);
-    Py_XDECREF(OBJECT(self->block));
+    history_change_block(self, NULL, 0);
     let_go_of(OBJECT(self));
 }
 
@@ -969,7 +1283,7 @@ enum { FEW = 64 }; /* samples whose histories fit on the stack */
 static Py_ssize_t
 store(PyObject *frames, PyObject *batch, Py_ssize_t first, int whole)
 {
-    const Py_ssize_t size = PyTuple_Size(batch);
+    const Py_ssize_t size = batch_size(batch);
     if (first < 0 || first >= size) {
         return size;
     }
@@ -980,18 +1294,23 @@ store(PyObject *frames, PyObject *batch, Py_ssize_t first, int whole)
     }
     Py_ssize_t stored = 0;
     int failed = 0;
+    PyObject *child = NULL;
+    History *history = NULL;
     while (first + stored < size) {
-        PyObject *item = PyTuple_GetItem(batch, first + stored);
-        const Sample *sample = (const Sample *)item;
-        if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL || sample->is_static) {
+        Sample scratch;
+        const Sample *sample = sample_at(batch, first + stored, &scratch);
+        if (sample == NULL || sample->is_static) {
             break;
         }
-        PyObject *known = PyDict_GetItemWithError(frames, sample->child);
-        if (known == NULL || !PyObject_TypeCheck(known, HistoryType)) {
-            failed = PyErr_Occurred() != NULL;
-            break;
+        if (sample->child != child) {
+            child = sample->child;
+            PyObject *known = PyDict_GetItemWithError(frames, child);
+            if (known == NULL || !PyObject_TypeCheck(known, HistoryType)) {
+                failed = PyErr_Occurred() != NULL;
+                break;
+            }
+            history = (History *)known;
         }
-        History *history = (History *)known;
         if (!history_continues(history, sample->parent, sample->stamp, sample->authority)) {
             break;
         }

@@ -153,11 +153,11 @@ static int
 feed_is_plain(const Feed *self, PyObject *batch)
 {
     PyObject *lines = self->parts[LINES], *limits = self->parts[LIMITS];
-    const Py_ssize_t size = PyTuple_Size(batch);
+    const Py_ssize_t size = batch_size(batch);
     for (Py_ssize_t i = 0; i < size; i++) {
-        PyObject *item = PyTuple_GetItem(batch, i);
-        const Sample *sample = (const Sample *)item;
-        if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL) {
+        Sample scratch;
+        const Sample *sample = sample_at(batch, i, &scratch);
+        if (sample == NULL) {
             return 0;
         }
         /* Anew each time, because comparing names may run Python code. */
@@ -318,8 +318,8 @@ feed_wake(const Feed *self, PyObject *child, int64_t stamp, Trouble *trouble)
 static PyObject *
 feed_insert(Feed *self, PyObject *batch)
 {
-    if (!PyTuple_CheckExact(batch)) {
-        PyErr_SetString(PyExc_TypeError, "a batch is a tuple of samples");
+    if (!is_batch(batch)) {
+        PyErr_SetString(PyExc_TypeError, "a batch is a tuple of samples, or columns");
         return NULL;
     }
     if (self->parts[PATHS] == NULL) {
@@ -337,9 +337,10 @@ feed_insert(Feed *self, PyObject *batch)
         return stored;
     }
     Trouble trouble = {NULL};
-    const Py_ssize_t size = PyTuple_Size(batch);
+    const Py_ssize_t size = batch_size(batch);
     for (Py_ssize_t i = 0; i < size; i++) {
-        const Sample *sample = (const Sample *)PyTuple_GetItem(batch, i);
+        Sample scratch;
+        const Sample *sample = sample_at(batch, i, &scratch);
         PyObject *child = sample->child;
         Py_INCREF(child);
         feed_wake(self, child, sample->stamp, &trouble);

@@ -430,7 +430,7 @@ async def expect(program: Program, pattern: str) -> str:
     return await anyio.to_thread.run_sync(program.output.expect, pattern)
 
 
-@pytest.mark.parametrize("younger", [False, True])
+@pytest.mark.parametrize("younger", [False, pytest.param(True, marks=pytest.mark.thorough)], ids=["elder", "younger"])
 async def test_the_end_of_a_killed_process_is_seen_and_its_name_removed(
     directory: str, loopback: bool, younger: bool
 ) -> None:
@@ -477,7 +477,7 @@ async def test_a_process_that_is_stopped_is_present_and_hears_afterwards_what_wa
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
-@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+@pytest.mark.parametrize("backend", ["asyncio", pytest.param("trio", marks=pytest.mark.thorough)])
 async def test_a_child_process_holds_no_connection_open(directory: str, backend: str) -> None:
     wire = LocalWire(DOMAIN, directory=directory)
     with start_peer(directory, "fork", backend) as program:
@@ -492,18 +492,20 @@ async def test_a_child_process_holds_no_connection_open(directory: str, backend:
             os.kill(int(child), signal.SIGKILL)
 
 
-@pytest.mark.parametrize("name", ["0" * 24, "f" * 24])
-async def test_a_file_at_which_nobody_listens_is_removed(directory: str, loopback: bool, name: str) -> None:
+async def test_a_file_at_which_nobody_listens_is_removed(directory: str, loopback: bool) -> None:
     elder = LocalWire(DOMAIN, directory=directory, loopback=loopback)
     async with running(elder):
         (path,) = files_in(directory)
-        if loopback:
-            with socket.create_server(("127.0.0.1", 0)) as server:
-                port = server.getsockname()[1]
-            path.with_name(name).write_text(f"{port} {'00' * 32}")
-        else:
-            with socket.socket(socket.AF_UNIX) as dead:
-                dead.bind(str(path.with_name(name)))
+        # A name of before the elder, and one of after both.
+        for name in ("0" * 24, "f" * 24):
+            if loopback:
+                with socket.create_server(("127.0.0.1", 0)) as server:
+                    port = server.getsockname()[1]
+                path.with_name(name).write_text(f"{port} {'00' * 32}")
+            else:
+                with socket.socket(socket.AF_UNIX) as dead:
+                    dead.bind(str(path.with_name(name)))
+        if not loopback:
             path.with_name("0" * 23 + "1").write_text("no socket")
         younger = LocalWire(DOMAIN, directory=directory, loopback=loopback)
         async with running(younger) as ear:

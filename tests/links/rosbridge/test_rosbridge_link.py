@@ -107,14 +107,14 @@ TINY = {
     "empty": b"\x81\0",
     "one byte": b"\x81\1x",
     "no operation": b"\x81\2{}",
-    "fragments": b"\x01\0" + b"\0\0" * 20_000,
+    "fragments": b"\x01\0" + b"\0\0" * 6_000,
 }
 
 
 @pytest.mark.parametrize("frames", TINY)
-async def test_tens_of_thousands_of_tiny_frames_share_the_event_loop_with_others(frames: str) -> None:
+async def test_thousands_of_tiny_frames_share_the_event_loop_with_others(frames: str) -> None:
     async with joined() as (server, _, link):
-        count = 1 if frames == "fragments" else 20_000
+        count = 1 if frames == "fragments" else 6_000
         await server.clients[0].stream.send(TINY[frames] * count + b"\x80\1x" * (frames == "fragments"))
         turns, most, before = 0, 0, 0
         while before < count:
@@ -123,7 +123,7 @@ async def test_tens_of_thousands_of_tiny_frames_share_the_event_loop_with_others
             seen = statistics.rejected.get("encoding", 0) + statistics.queue.pending
             turns, most, before = turns + 1, max(most, seen - before), seen
         # In one turn, it would be all of a read.
-        assert most < 5_000
+        assert most < 3_000
         assert turns > 5
         await server.say(moving("map", "base", 5))
         await until(lambda: link.statistics().received_samples == 1)

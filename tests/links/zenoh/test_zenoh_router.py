@@ -1,11 +1,13 @@
 import asyncio
+from pathlib import Path
 
 import anyio
 import pytest
 from support.processes import free_address, until
-from support.zenoh_wires import Ear, Way, listening, met, start_router, talk, way_to
+from support.zenoh_wires import LIVE, Ear, Way, listening, met, start_router, talk, way_to
 
-from tfbus.links.seams import Left
+from tfbus.links.seams import Joined, Left
+from tfbus.links.zenoh.sessions import router_config
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
 
 pytestmark = pytest.mark.anyio
@@ -84,6 +86,56 @@ async def test_an_address_in_use_is_an_os_error_and_a_router_is_entered_once(add
             await router.__aenter__()
     async with ZenohRouter(address):
         pass
+
+
+RULES = """{
+  // Robots of the name guest publish nothing.
+  access_control: {
+    enabled: true,
+    default_permission: "allow",
+    rules: [{
+      id: "publishing", messages: ["put"], flows: ["ingress"], permission: "deny", key_exprs: ["tfbus/*/guest/**"],
+    }],
+    subjects: [{id: "all"}],
+    policies: [{rules: ["publishing"], subjects: ["all"]}],
+  },
+}"""
+
+
+async def test_a_router_keeps_to_the_rules_of_a_file(address: str, domain: str, tmp_path: Path) -> None:
+    file = tmp_path / "rules.json5"
+    file.write_text(RULES, encoding="utf-8")
+    async with (
+        ZenohRouter(address, config=file),
+        listening(domain, "guest", connect=address) as guest,
+        listening(domain, "robot", connect=address) as robot,
+        listening(domain, connect=address) as hears,
+    ):
+        await met(guest, robot, hears)
+        guest.wire.publish(LIVE, b"refused")
+        assert guest.wire.send(hears.id, b"a question")
+        await until(lambda: hears.of(guest) == [Joined("guest"), b"a question"])
+        robot.wire.publish(LIVE, b"published")
+        await until(lambda: hears.of(robot) == [Joined("robot"), b"published"])
+        assert hears.of(guest) == [Joined("guest"), b"a question"]
+
+
+def test_a_file_of_settings_wins_over_those_of_the_router_but_for_addresses(tmp_path: Path) -> None:
+    file = tmp_path / "settings.json5"
+    file.write_text("{transport: {link: {tx: {lease: 7000}}}}", encoding="utf-8")
+    config = router_config("tcp/127.0.0.1:0", (), str(file), 2.0)
+    assert config.get_json("transport/link/tx/lease") == "7000"
+    assert config.get_json("scouting/multicast/enabled") == "false"
+    for text, problem in (
+        ('{listen: {endpoints: ["tcp/0.0.0.0:1"]}}', "'listen' is not for config: give addresses by connect and"),
+        ("{no_such_setting: 1}", "zenoh does not take the settings in .*settings.json5: unknown field"),
+        ("garbage", "zenoh does not take the settings in"),
+    ):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(ValueError, match=problem):
+            ZenohRouter(config=file)
+    with pytest.raises(FileNotFoundError):
+        ZenohRouter(config=tmp_path / "none.json5")
 
 
 @pytest.mark.thorough

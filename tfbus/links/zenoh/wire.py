@@ -34,7 +34,7 @@ import os
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from random import uniform
@@ -51,6 +51,7 @@ from tfbus.links.zenoh.sessions import (
     LONGEST_NAME,
     Addresses,
     Keeper,
+    Settings,
     begin_to_close,
     client_config,
     close_session,
@@ -94,8 +95,9 @@ class ZenohWire(Wire):
         when the session with it breaks. With `listen` the router of this process connects to all of them.
     listen : str or iterable of str, optional
         Run a router in this process that listens there.
-    config : mapping of str to any, optional
-        Settings of zenoh by their path: TLS, access control.
+    config : mapping of str to any, or str or path, optional
+        Settings of zenoh by their path: TLS, access control. Or the name of a file of them, as zenoh's own router
+        takes it.
     lease : float, optional
         Seconds of silence after which the other end takes this one for lost; by default `sessions.LEASE`.
 
@@ -114,7 +116,7 @@ class ZenohWire(Wire):
         *,
         connect: Addresses | None = None,
         listen: Addresses | None = None,
-        config: Mapping[str, Any] | None = None,
+        config: Settings | None = None,
         lease: float | None = None,
     ) -> None:
         self.id = os.urandom(16).hex()

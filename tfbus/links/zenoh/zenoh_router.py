@@ -1,16 +1,22 @@
 """A zenoh router in this process, which links and other routers connect to."""
 
 import threading
-from collections.abc import Mapping
 from time import monotonic
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import anyio
 import anyio.to_thread
 
 from tfbus.links.zenoh.neighbours import PERIOD, Neighbours, open_router
-from tfbus.links.zenoh.sessions import Addresses, Keeper, begin_to_close, close_session, router_config
+from tfbus.links.zenoh.sessions import (
+    Addresses,
+    Keeper,
+    Settings,
+    begin_to_close,
+    close_session,
+    router_config,
+)
 from tfbus.registration import warn_unless_entered
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
@@ -32,8 +38,9 @@ class ZenohRouter:
         zenoh's endpoints; by default ``tcp/127.0.0.1:17447``, which only this machine reaches.
     connect : str or iterable of str, optional
         The addresses of other routers.
-    config : mapping of str to any, optional
-        Settings of zenoh by their path: TLS, access control.
+    config : mapping of str to any, or str or path, optional
+        Settings of zenoh by their path: TLS, access control. Or the name of a file of them, as zenoh's own router
+        takes it.
     lease : float, optional
         Seconds of silence after which the router is taken for lost, and so the time in which links notice that they are
         cut off from it; 4 s by default.
@@ -43,7 +50,8 @@ class ZenohRouter:
     ValueError, TypeError
         If zenoh does not take an address or a setting, or an argument has another type.
     OSError
-        On entering, if it cannot listen where it should.
+        If the file of settings cannot be read; on entering, if the router cannot listen where it should, or zenoh
+        finds that its rules do not fit together.
     RuntimeError
         On entering a second time.
     """
@@ -53,7 +61,7 @@ class ZenohRouter:
         listen: Addresses = ROUTER,
         *,
         connect: Addresses | None = None,
-        config: Mapping[str, Any] | None = None,
+        config: Settings | None = None,
         lease: float | None = None,
     ) -> None:
         self._config = router_config(listen, connect or (), config, lease)
