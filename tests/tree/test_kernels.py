@@ -439,6 +439,14 @@ def test_wrong_arguments_raise_and_never_crash() -> None:
         lambda: kernel.commit({}, [], 0),
         lambda: kernel.commit({}, (), "0"),
         lambda: kernel.Block(),
+        lambda: kernel.Columns(),
+        lambda: kernel.columns("map", "cart"),
+        lambda: kernel.columns("map", "cart", 5, bytearray(56), "", False, 1.0),
+        lambda: kernel.columns("map", "cart", bytes(8), bytes(56), "", False, 1.0),
+        lambda: kernel.columns("map", "cart", bytes(16), bytearray(56), "", False, 1.0),
+        lambda: kernel.columns(("map", "map"), "cart", bytes(8), bytearray(56), "", False, 1.0),
+        lambda: kernel.columns("map", 5, bytes(8), bytearray(56), "", False, 1.0),
+        lambda: kernel.columns("map", "cart", bytes(0), bytearray(0), "", False, 1.0).samples(int),
     ):
         with pytest.raises((TypeError, ValueError, IndexError, AttributeError, BufferError, RuntimeError)):
             call()
