@@ -49,7 +49,7 @@ def trouble(
             case 0:
                 process.publish(draw.choice(NAMES), static=True)
             case 1:
-                process.publish(f"moving of {process.name}", static=False)
+                process.publish(draw.choice([f"moving of {process.name}", "moving of all"]), static=False)
             case 2:
                 process.remove(draw.choice([*process.frames, *NAMES]))
             case 3 if len(world.processes) < 6:

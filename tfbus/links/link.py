@@ -602,8 +602,6 @@ class DomainLink(Link):
         policy_of(tolerance, max_gap, extrapolate)
         limit = math.inf if timeout is None else as_duration(timeout, "timeout")
         question = RemoteQuestion(
-            asker=self.id,
-            number=0,
             target=target,
             source=source,
             at=at if isinstance(at, Latest) else as_stamp(at),
