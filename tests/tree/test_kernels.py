@@ -484,6 +484,14 @@ def test_wrong_arguments_raise_and_never_crash() -> None:
         lambda: kernel.fill_matrix(IDENTITY, np.empty(7)),
         lambda: kernel.fill_matrix(IDENTITY, bytes(128)),
         lambda: kernel.move_points(IDENTITY),
+        lambda: kernel.Columns(),
+        lambda: kernel.columns("map", "cart"),
+        lambda: kernel.columns("map", "cart", 5, bytearray(56), "", False, 1.0),
+        lambda: kernel.columns("map", "cart", bytes(8), bytes(56), "", False, 1.0),
+        lambda: kernel.columns("map", "cart", bytes(16), bytearray(56), "", False, 1.0),
+        lambda: kernel.columns(("map", "map"), "cart", bytes(8), bytearray(56), "", False, 1.0),
+        lambda: kernel.columns("map", 5, bytes(8), bytearray(56), "", False, 1.0),
+        lambda: kernel.columns("map", "cart", bytes(0), bytearray(0), "", False, 1.0).samples(int),
     ):
         with pytest.raises((TypeError, ValueError, IndexError, AttributeError, BufferError, RuntimeError)):
             call()

@@ -105,6 +105,17 @@ imported(const char *module, const char *name)
     return value;
 }
 
+/* Whether an object is an array of numpy, and of no derived class; -1 for an error. */
+static int
+is_array(PyObject *object)
+{
+    /* Not when the kernel is loaded, because `tfbus --version` does without numpy. */
+    if (array_type == NULL && (array_type = imported("numpy", "ndarray")) == NULL) {
+        return -1;
+    }
+    return OBJECT(Py_TYPE(object)) == array_type;
+}
+
 /* Whether a call has no keyword arguments; else there is an error. */
 static int
 has_no_keywords(PyObject *kwargs)

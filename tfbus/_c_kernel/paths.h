@@ -833,13 +833,10 @@ room_for_rows(PyObject *stamps)
     if (is_list || is_tuple) {
         count = is_list ? PyList_Size(stamps) : PyTuple_Size(stamps);
     } else {
-        /* Not when the kernel is loaded, because `tfbus --version` does without numpy. */
-        if (array_type == NULL && (array_type = imported("numpy", "ndarray")) == NULL) {
-            return NULL;
-        }
+        const int plain = is_array(stamps);
         /* Python judges arrays with a mask. */
-        if (OBJECT(Py_TYPE(stamps)) != array_type
-            && (!PyObject_CheckBuffer(stamps) || PyObject_HasAttrString(stamps, "mask"))) {
+        if (plain < 0
+            || (!plain && (!PyObject_CheckBuffer(stamps) || PyObject_HasAttrString(stamps, "mask")))) {
             return NULL;
         }
         if (PyObject_GetBuffer(stamps, &view, PyBUF_STRIDES | PyBUF_FORMAT) < 0) {

@@ -185,7 +185,11 @@ row_of_matrix(PyObject *Py_UNUSED(module), PyObject *matrix)
     double row[WIDTH];
     Py_buffer view;
     Py_ssize_t count;
-    if (OBJECT(Py_TYPE(matrix)) != array_type) {
+    const int is_plain = is_array(matrix);
+    if (is_plain < 0) {
+        return NULL;
+    }
+    if (!is_plain) {
         Py_RETURN_NONE;
     }
     if (PyObject_GetBuffer(matrix, &view, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {

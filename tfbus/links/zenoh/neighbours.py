@@ -9,42 +9,46 @@ and keeps what it was told before: links that have gone stay present, and others
   anything.
 - A transport that ends and begins anew within the 100 ms in which a router computes its routes only once is no change.
 
-So each router of tfbus has a token. A router whose token has gone while the router is connected is one of these cases,
-because zenoh tells tokens and subscribers by the same way. The cure is a new session, which is another router to all
-others: it is told everything. Its clients connect again, as after any break.
+So each router of tfbus has an id that shows that it is one, and a token. A router that is connected without its token
+is one of these cases, because zenoh tells tokens and subscribers by the same way. The cure is a new session with
+another id, which is a new router to all others: it is told everything. Its clients connect again, as after any break.
 """
 
+import json
+import os
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from random import uniform
 from typing import Any, Final
 
 import zenoh
 
-PATIENCE: Final = 3.0
-"""s; so long a router may be connected without its token."""
-PERIOD: Final = 0.5
-"""s between two looks while the token of any router is missing."""
-MOST_MISSING: Final = 1_000
+from tfbus.links.zenoh.sessions import open_session
+
+PATIENCE: Final = 2.0, 5.0
+"""s; so long a router may be connected without its token; drawn at random, so that not both begin anew at once."""
+PERIOD: Final = 1.0
+"""s between two looks at the connected routers."""
+MOST_ROUTERS: Final = 10_000
+"""So many tokens are remembered."""
+_MARK: Final = b"tfbus".hex()
 _TOKENS: Final = "tfbus/@router/"
 
 
+def open_router(config: zenoh.Config) -> zenoh.Session:
+    """Open the session of a router; raises as `open_session`."""
+    config.insert_json5("id", json.dumps(_MARK + os.urandom(11).hex()))
+    return open_session(config)
+
+
 class Neighbours:
-    """The session of a router, with the other routers of tfbus that it has heard of.
+    """The other routers of tfbus that the session of a router is connected to."""
 
-    Parameters
-    ----------
-    session : zenoh.Session
-    changed : callable
-        Called, in zenoh's threads, when a token has gone.
-    """
-
-    def __init__(self, session: zenoh.Session, changed: Callable[[], object]) -> None:
+    def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self._info = session.info
-        self._changed = changed
+        self._patience = uniform(*PATIENCE)
         self._lock = threading.Lock()
-        self._missing: dict[str, None] = {}
+        self._heard: set[str] = set()
         # Since when each router is connected without its token.
         self._silent: dict[str, float] = {}
         take = zenoh.handlers.Callback(self._take, indirect=False)
@@ -54,18 +58,13 @@ class Neighbours:
             liveliness.declare_token(f"{_TOKENS}{self._info.zid()}"),
         ]
 
-    @property
-    def period(self) -> float | None:
-        """The time in s after which `are_silent` is to be called again; None if not before `changed`."""
-        return PERIOD if self._missing else None
-
     def are_silent(self, now: float) -> bool:
-        """Whether a router has been connected for `PATIENCE` without its token, which it has had before."""
-        connected = {str(zid) for zid in self._info.routers_zid()} if self._missing else set()
+        """Whether one of them has been connected too long without its token; to be called every `PERIOD`."""
+        connected = {router for zid in self._info.routers_zid() if (router := str(zid)).startswith(_MARK)}
         with self._lock:
-            missing = connected & self._missing.keys()
+            missing = connected - self._heard
         self._silent = {router: self._silent.get(router, now) for router in missing}
-        return any(now - since >= PATIENCE for since in self._silent.values())
+        return any(now - since >= self._patience for since in self._silent.values())
 
     def close(self) -> None:
         """Close the session; blocks."""
@@ -78,11 +77,7 @@ class Neighbours:
     def _take(self, sample: zenoh.Sample) -> None:
         router = str(sample.key_expr)[len(_TOKENS) :]
         with self._lock:
-            if sample.kind == zenoh.SampleKind.PUT:
-                self._missing.pop(router, None)
-                return
-            self._missing[router] = None
-            if len(self._missing) > MOST_MISSING:
-                del self._missing[next(iter(self._missing))]
-        with suppress(Exception):
-            self._changed()
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._heard.discard(router)
+            elif router.startswith(_MARK) and len(self._heard) < MOST_ROUTERS:
+                self._heard.add(router)

@@ -46,7 +46,7 @@ import zenoh
 
 from tfbus._aio.loops import LoopWaker
 from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
-from tfbus.links.zenoh.neighbours import Neighbours
+from tfbus.links.zenoh.neighbours import PERIOD, Neighbours, open_router
 from tfbus.links.zenoh.sessions import (
     LONGEST_NAME,
     Addresses,
@@ -57,7 +57,6 @@ from tfbus.links.zenoh.sessions import (
     close_session,
     endpoints,
     open_client,
-    open_session,
     os_error,
     router_config,
 )
@@ -249,7 +248,7 @@ class ZenohWire(Wire):
 
     def _connect_once(self, channels: Iterable[str]) -> "_Session":
         self._number += 1
-        raw = open_session(self._config) if self._is_router else open_client(self._config, self._addresses[0])
+        raw = open_router(self._config) if self._is_router else open_client(self._config, self._addresses[0])
         self._has_listened = self._is_router
         hearer = _Hearer(self.id, self._domain, self._hears, self._receive, self._keeper.changed)
         session = _Session(raw, hearer, self._own, self.id)
@@ -298,13 +297,13 @@ class _Session:
     @property
     def period(self) -> float | None:
         """The time in s after which `is_broken` is to be called again; None if not before a change."""
-        return None if self._neighbours is None else self._neighbours.period
+        return None if self._neighbours is None else PERIOD
 
     def begin(self, domain: str, number: int, hears: Sequence[Hearing], *, is_router: bool) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
         session, hearer, declared = self._session, self.hearer, self._declared
         if is_router:
-            self._neighbours = Neighbours(session, hearer.changed.set)
+            self._neighbours = Neighbours(session)
         else:
             declared.append(session.info.declare_transport_events_listener(_directly(hearer.take_event)))
         for index, (robots, channel) in enumerate(hears):
@@ -381,7 +380,7 @@ class _Hearer:
         self._rest = len(domain) + 1
         self._hears = hears
         self._receive = receive
-        self.changed = changed
+        self._changed = changed
         self._lock = threading.Lock()
         self._ended = False
         # The number of the newest session of each link that is present, and which of `hears` is for it.
@@ -430,7 +429,7 @@ class _Hearer:
     def take_event(self, event: zenoh.TransportEvent) -> None:
         if event.kind == zenoh.SampleKind.DELETE:
             self.broken = True
-            self.changed.set()
+            self._changed.set()
 
     def end(self) -> None:
         """Have all links leave, and take nothing any more; in any thread."""

@@ -8,14 +8,13 @@ from typing import Final, Self
 import anyio
 import anyio.to_thread
 
-from tfbus.links.zenoh.neighbours import Neighbours
+from tfbus.links.zenoh.neighbours import PERIOD, Neighbours, open_router
 from tfbus.links.zenoh.sessions import (
     Addresses,
     Keeper,
     Settings,
     begin_to_close,
     close_session,
-    open_session,
     router_config,
 )
 from tfbus.registration import warn_unless_entered
@@ -97,7 +96,7 @@ class ZenohRouter:
         keeper = self._keeper
         while not (self._opened.is_set() and keeper.stopped):
             try:
-                router = Neighbours(open_session(self._config), keeper.changed.set)
+                router = Neighbours(open_router(self._config))
             except OSError as error:
                 if not self._opened.is_set():
                     self._failure = error
@@ -109,7 +108,7 @@ class ZenohRouter:
             finally:
                 self._opened.set()
             while not (keeper.stopped or router.are_silent(monotonic())):
-                keeper.changed.wait(router.period)
+                keeper.changed.wait(PERIOD)
                 keeper.changed.clear()
             if keeper.stopped:
                 close_session(router)
