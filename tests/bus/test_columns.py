@@ -3,6 +3,7 @@
 import logging
 from typing import Any
 
+import anyio
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -217,6 +218,26 @@ def test_a_broadcaster_sends_columns_under_its_names() -> None:
         assert buffer.tree.frames() == ["map", "r/a"]
         assert [edge.authority for edge in buffer.tree.edges()] == ["driver"]
         assert buffer.lookup_nowait("map", "r/a", 5).transform.translation == (2.0, 0.0, 0.0)
+
+
+@pytest.mark.anyio
+async def test_columns_wake_the_lookups_that_waited_for_a_row() -> None:
+    found: list[TransformStamped] = []
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        bus.publish_columns("map", ["a", "b"], 0, np.zeros((2, 3)), [STILL] * 2)
+
+        async def wait_for(frame: str, stamp: int) -> None:
+            found.append(await buffer.lookup("map", frame, stamp))
+
+        async with anyio.create_task_group() as tasks:
+            for frame, stamp in (("a", 2), ("a", 3), ("b", 2), ("c", 1)):
+                tasks.start_soon(wait_for, frame, stamp)
+            await anyio.wait_all_tasks_blocked()
+            bus.publish_columns(**three_rows({}))
+            await anyio.wait_all_tasks_blocked()
+            assert sorted((answer.stamp, answer.transform.translation[0]) for answer in found) == [(2, 1.0), (3, 2.0)]
+            bus.publish_columns("map", ["b", "c"], [2, 1], np.ones((2, 3)), [STILL] * 2)
+        assert {(answer.child, answer.stamp) for answer in found[2:]} == {("b", 2), ("c", 1)}
 
 
 def test_a_closed_bus_and_a_tree_of_a_bus_take_no_columns() -> None:

@@ -17,7 +17,7 @@ from urllib.parse import quote
 import anyio
 import httpx
 import pytest
-from support.processes import Program, new_domain
+from support.processes import Program
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
@@ -183,25 +183,6 @@ def arm_sees(seconds: float) -> tuple[float, float, float]:
     reach = sum(part * math.cos(angle) for part, angle in zip(parts, angles, strict=True))
     height = 0.5 - sum(part * math.sin(angle) for part, angle in zip(parts, angles, strict=True))
     return reach * math.cos(pan), reach * math.sin(pan), height
-
-
-@pytest.mark.thorough
-def test_the_tutorials_two_programs_find_each_other_in_either_order_and_one_goes_on_without_the_other() -> None:
-    domain = new_domain()
-    info = (
-        r"^\[ INFO\] \d+\.\d{9}: base_laser: \(1\.00, 0\.20\. 0\.00\) -----> "
-        r"base_link: \(1\.10, 0\.20, 0\.20\) at time \d+\.\d\d$"
-    )
-    with Program(sys.executable, DEMOS / "tf_listener.py", domain) as listener:
-        listener.output.expect(r"^\[ERROR\] .*: frame 'base_link' is not known$")
-        with Program(sys.executable, DEMOS / "tf_broadcaster.py", domain) as broadcaster:
-            listener.output.expect(info)
-            assert broadcaster.end() == 130
-        listener.output.expect(r"^\[ERROR\] .*: frame 'base_laser': asked for .*, from 'robot_tf_publisher'$")
-        with Program(sys.executable, DEMOS / "tf_broadcaster.py", domain):
-            listener.output.expect(info)
-        assert listener.end() == 130
-    assert (listener.errors.text, broadcaster.errors.text, broadcaster.output.text) == ("", "", "")
 
 
 @pytest.mark.thorough

@@ -142,26 +142,6 @@ class Asker:
         return told.samples[0].child, (told.sequence, told.origin)
 
 
-def test_the_first_peer_is_asked_for_all_at_once_and_others_only_if_they_differ() -> None:
-    link = Asker("a", "b")
-    link.say("a", "b", heard=False)
-    assert link.next_question(0.0) == Question("a", 0)
-    assert link.agreement.question(link.now) is None, "there is one question at a time"
-    link.sign("b")
-    link.answer(Question("a", 0))
-    assert link.next_question() is None
-    link.say("b", heard=False)
-    link.sign("b")
-    asked_from = link.now
-    question = link.next_question()
-    assert question is not None
-    assert question.peer == "b"
-    assert 0.3 <= link.now - asked_from <= 0.7
-    link.answer(question)
-    assert link.next_question() is None
-    assert ranks_in(link.replica) == ranks_in(link.peers["b"])
-
-
 def test_a_peer_that_comes_back_is_asked_for_what_is_new() -> None:
     link = Asker("a")
     link.say("a", heard=False)
@@ -265,50 +245,3 @@ def test_a_link_that_is_behind_asks_only_the_first_question_at_once_and_one_in_t
         link.answer(question)
         asked.append(question.peer)
     assert sorted(asked) == ["a", "b"]
-
-
-def test_what_a_link_has_read_meanwhile_is_not_asked_for() -> None:
-    link = Asker("a")
-    link.answer(link.next_question(0.0) or Question("", 0))
-    link.say("a", heard=False)
-    link.sign("a")
-    link.is_behind = True
-    assert link.next_question(5.0) is None
-    link.replica.note("f1", (1, OTHER), static("map", "f1"))
-    link.is_behind = False
-    assert link.next_question() is None
-
-
-def test_an_answer_that_leads_nowhere_or_was_not_asked_for_changes_nothing() -> None:
-    link = Asker("a", "b")
-    link.agreement.answered("a", Claim(0, 9, 0), True, link.now)
-    assert link.next_question(0.0) == Question("a", 0)
-    link.agreement.answered("b", Claim(0, 9, 0), True, link.now)
-    link.agreement.answered("nobody", Claim(0, 9, 0), True, link.now)
-    assert link.agreement.question(link.now) is None
-    link.agreement.answered("a", Claim(0, 0, 0, final=False), False, link.now)
-    assert link.agreement.question(link.now) is None, "it is asked again after a pause"
-    assert link.next_question() == Question("a", 0)
-    assert link.now > 0.5
-
-
-def test_a_claim_of_some_frames_only_and_one_that_was_overtaken_say_nothing() -> None:
-    link = Asker("a")
-    link.answer(link.next_question() or Question("", 0))
-    link.agreement.told("a", Claim(9, 9, 9, partial=True), link.now)
-    assert link.next_question(100.0) is None
-    link.say("a")
-    link.say("a")
-    link.sign("a")
-    link.agreement.told("a", Claim(1, 1, 77), link.now)
-    link.agreement.told("nobody", Claim(1, 1, 77), link.now)
-    assert link.next_question(100.0) is None
-
-
-def test_when_the_peer_leaves_that_was_asked_first_the_next_one_is_asked_for_all() -> None:
-    link = Asker("a")
-    assert link.next_question(0.0) == Question("a", 0)
-    link.agreement.left("a")
-    link.agreement.left("a")
-    link.agreement.joined("b", link.replica, link.now)
-    assert link.next_question(0.0) == Question("b", 0)

@@ -22,7 +22,6 @@ from tfbus import (
     SECOND,
     Buffer,
     Bus,
-    BusClosedError,
     DisconnectedError,
     FutureExtrapolationError,
     LookupTimeoutError,
@@ -298,27 +297,6 @@ async def test_an_exception_of_the_callback_is_isolated_and_logged_once(
 # How it ends
 
 
-@pytest.mark.parametrize("closed", ["bus", "buffer"])
-async def test_closing_ends_the_iteration_after_the_ready_messages(
-    closed: str, bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    drops = DroppedMessages()
-    got: list[Pair] = []
-    bus.publish(moving("map", "laser", 5))
-    async with MessageFilter(streams.receive, buffer, "map", on_drop=drops) as pairs:
-        put(streams, Scan(5), Scan(6))
-        await settle()
-        (bus if closed == "bus" else buffer).close()
-        put(streams, Scan(5))
-        await read(pairs, got)
-        assert stamps(got) == [5]
-        assert drops.told == [(Scan(6), "closed")]
-        error = drops.all[0][2]
-        assert isinstance(error, BusClosedError)
-        assert isinstance(error.__cause__, FutureExtrapolationError)
-        assert streams.receive.statistics().current_buffer_used == 1
-
-
 async def test_a_filter_belongs_to_the_loop_of_its_bus(buffer: Buffer) -> None:
     errors: list[Exception] = []
 
@@ -414,19 +392,6 @@ class Source:
         if self._messages:
             return self._messages.pop(0)
         raise self._error
-
-
-async def test_an_error_of_the_source_is_raised_after_the_ready_messages(bus: Bus, buffer: Buffer) -> None:
-    bus.publish(moving("map", "laser", 5))
-    error = OSError("unplugged")
-    got: list[Pair] = []
-    with pytest.raises(OSError, match="unplugged") as caught:
-        async with MessageFilter(Source(error, Scan(6), Scan(5)), buffer, "map") as pairs:
-            await settle()
-            await read(pairs, got)
-    assert caught.value is error
-    assert stamps(got) == [5]
-    assert (pairs.dropped, buffer.pending()) == ({"closed": 1}, ())
 
 
 async def test_an_error_of_the_source_is_raised_at_the_end_if_it_was_not_read(buffer: Buffer) -> None:
@@ -747,32 +712,3 @@ async def test_a_callback_may_call_the_filter_and_the_bus(bus: Bus, buffer: Buff
         assert (seen, pairs.callbacks_failed) == ([1, 2], 0)
         assert [(await anext(pairs))[1].parent] == ["odom"]
         assert pairs.dropped == {"queue full": 1, "too old": 1}
-
-
-@pytest.mark.parametrize("order", ["stamp", "arrival"])
-async def test_a_waiting_message_holds_back_later_ones_until_it_is_dropped(
-    order: Any, clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    got: list[Pair] = []
-    bus.publish(moving("map", "laser", 2))
-    pairs = MessageFilter(streams.receive, buffer, "map", timeout=1.0, order=order)
-    async with anyio.create_task_group() as tasks, pairs:
-        tasks.start_soon(read, pairs, got)
-        put(streams, Scan(1, "nobody"), Scan(2))
-        await clock.advance(0.9)
-        assert got == []
-        await clock.advance(0.2)
-        assert stamps(got) == [2]
-        tasks.cancel_scope.cancel()
-
-
-async def test_a_full_queue_of_ready_messages_drops_without_an_error(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    drops = DroppedMessages()
-    bus.publish([moving("map", "laser", 0), moving("map", "laser", 9)])
-    put(streams, *map(Scan, range(1, 6)))
-    async with MessageFilter(streams.receive, buffer, "map", capacity=2, on_drop=drops) as pairs:
-        await settle()
-        assert drops.all == [(Scan(stamp), "queue full", None) for stamp in (1, 2, 3)]
-        assert stamps([await anext(pairs) for _ in range(2)]) == [4, 5]

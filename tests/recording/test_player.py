@@ -526,26 +526,6 @@ async def test_a_played_recording_can_be_recorded_again(bus: Bus, tmp_path: Path
     assert batches_in(copy) == batches_in(path)
 
 
-def test_play_can_be_cancelled_under_plain_asyncio(tmp_path: Path) -> None:
-    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 3_600.0)))
-
-    async def main() -> None:
-        with Bus() as bus:
-            heard = Listener(bus)
-            player = Player(bus, path)
-            for count in (1, 2):
-                task = asyncio.create_task(player.play())
-                await heard.until(count)
-                task.cancel()
-                with pytest.raises(asyncio.CancelledError):
-                    await task
-            with pytest.raises(TimeoutError):
-                async with asyncio.timeout(0.01):
-                    await player.play()
-
-    asyncio.run(main())
-
-
 def test_a_file_that_a_thread_opens_while_plain_asyncio_cancels_play_is_closed(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0,)))
     go_on = threading.Event()

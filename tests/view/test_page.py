@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from support.samples import moving, over, static, tree_of
 
-from tfbus import LATEST, SECOND, Buffer, Bus, Latest, SimulatedClock, Transform, TransformStamped, TransformTree
+from tfbus import LATEST, SECOND, Latest, Transform, TransformStamped, TransformTree
 from tfbus.events import FrameRemoved
 from tfbus.tree.history import EdgeState
 from tfbus.tree.tree import forest_of
@@ -47,23 +47,6 @@ def test_a_recording_starts_at_its_oldest_sample_and_cannot_go_live() -> None:
     assert x_of(page, "lidar") == 5.0
 
 
-def test_a_pause_keeps_the_history_that_there_was() -> None:
-    clock = SimulatedClock(10 * SECOND)
-    bus = Bus(clock)
-    with Buffer(bus, keep=5.0) as buffer:
-        bus.publish(over("map", "base", range(0, 11 * SECOND, SECOND), speed=1e-9))
-        page = Page(buffer.tree)
-        page.freeze()
-        bus.publish(moving("map", "base", 100 * SECOND, 100.0))
-        page.timeline.seek(6 * SECOND)
-        assert x_of(page, "base") == 6.0
-        page.timeline.play()
-        page.freeze()
-        assert (page.timeline.playing, page.timeline.stamp) == (False, 6 * SECOND)
-        page.go_live()
-        assert x_of(page, "base") == 100.0
-
-
 def test_playing_while_live_plays_the_history_from_its_start() -> None:
     page = Page(driven())
     page.play()
@@ -98,19 +81,6 @@ def test_a_page_without_frames_waits() -> None:
     assert page.picture(0).scene.frames == ()
     assert "waiting for transforms" in texts(page).status
     assert "no frames" in texts(page).tree
-
-
-def test_the_selected_frame_is_described_and_marked_in_the_tree() -> None:
-    page = Page(driven())
-    assert "Click on a frame" in texts(page).selection
-    page.delays = {"base": 0.25}
-    page.select("base")
-    shown = texts(page, 12 * SECOND)
-    assert all(fact in shown.selection for fact in ("10.000000 0.000000 0.000000 m", "2 s", "250 ms"))
-    assert shown.tree.count("background") == 1
-    page.select(None)
-    assert "Click on a frame" in texts(page).selection
-    assert texts(page).tree.count("background") == 0
 
 
 def test_the_newest_events_come_first_and_the_oldest_are_forgotten() -> None:

@@ -13,7 +13,7 @@ import tempfile
 import threading
 import tracemalloc
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from random import Random
 from time import monotonic
@@ -544,60 +544,6 @@ async def test_links_work_where_the_system_has_no_poll_object_that_is_a_file(
             await ear.until(lambda: (ear.messages(two.id), ear.messages(three.id)) == ([large], [b"to all"]))
         await ear.left(two.id)
         await ear.left(three.id)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("seed", range(2))
-async def test_all_links_meet_after_processes_were_killed_stopped_and_started_and_the_directory_removed(
-    directory: str, seed: int
-) -> None:
-    random = Random(seed)
-    with ExitStack() as stack:
-
-        def start() -> Program:
-            return stack.enter_context(start_peer(directory, backend=random.choice(["asyncio", "trio"])))
-
-        programs, stopped = [start() for _ in range(6)], list[Program]()
-        for _ in range(30):
-            await anyio.sleep(random.uniform(0.0, 0.3))
-            chosen = random.choice(programs)
-            match random.choice(["kill", "kill", "stop", "go on", "remove"]):
-                case "kill":
-                    chosen.process.kill()
-                    programs[programs.index(chosen)] = start()
-                case "stop":
-                    chosen.process.send_signal(signal.SIGSTOP)
-                    stopped.append(chosen)
-                case "go on" if stopped:
-                    stopped.pop().process.send_signal(signal.SIGCONT)
-                case "remove":
-                    shutil.rmtree(directory, ignore_errors=True)
-        for program in stopped:
-            program.process.send_signal(signal.SIGCONT)
-        ids = {program: (await expect(program, "^open")).split()[1] for program in programs}
-        wire = LocalWire(DOMAIN, directory=directory)
-        async with running(wire) as ear:
-            everybody = {wire.id, *ids.values()}
-            views: dict[str, set[str]] = {}
-            with anyio.move_on_after(10):
-                while not views or any(view != everybody for view in views.values()):
-                    await anyio.sleep(0.1)
-                    views = {link: {link, *present_in(program.output.text)} for program, link in ids.items()}
-                    views[wire.id] = {wire.id, *ear.present()}
-            assert views == dict.fromkeys(everybody, everybody)
-        assert [program.errors.text for program in programs] == [""] * 6
-
-
-def present_in(output: str) -> set[str]:
-    """The links that have joined and not left, by the output of a peer."""
-    present: set[str] = set()
-    for line in output.splitlines():
-        match line.split():
-            case [link, "Joined"]:
-                present.add(link)
-            case [link, "Left"]:
-                present.discard(link)
-    return present
 
 
 @pytest.mark.every_loop

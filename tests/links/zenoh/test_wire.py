@@ -476,52 +476,6 @@ async def test_a_link_closes_while_its_router_is_stopped(address: str, domain: s
         router.process.send_signal(signal.SIGCONT)
 
 
-@pytest.mark.thorough
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_child_that_was_forked_from_a_process_that_uses_zenoh_is_told() -> None:
-    program = f"""
-import os, anyio
-from tfbus.links.zenoh.wire import ZenohWire
-async def open_one():
-    wire = ZenohWire("d", connect="{free_address()}")
-    try:
-        await wire.open([], print, print)
-    finally:
-        await wire.close()
-anyio.run(open_one)
-child = os.fork()
-if child == 0:
-    try:
-        anyio.run(open_one)
-    except RuntimeError as error:
-        os._exit(7 if "forked" in str(error) else 8)
-    os._exit(9)
-print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-"""
-    with Program(sys.executable, "-c", program) as done:
-        assert done.wait() == 0, done.errors.text
-        assert done.output.text.strip() == "7"
-
-
-@pytest.mark.thorough
-async def test_a_program_may_exit_without_closing_its_wire(address: str, domain: str) -> None:
-    program = f"""
-import anyio
-from tfbus.links.seams import Hearing
-from tfbus.links.zenoh.wire import ZenohWire
-async def main():
-    wire = ZenohWire("{domain}", connect="{address}")
-    await wire.open([Hearing("*", "live")], lambda link, item: None, print)
-    wire.publish("live", b"last words")
-anyio.run(main)
-"""
-    async with ZenohRouter(address), listening(domain, connect=address) as one:
-        with Program(sys.executable, "-c", program) as done:
-            assert await anyio.to_thread.run_sync(done.wait) == 0
-            assert done.errors.text == ""
-        await until(lambda: any(isinstance(item, Left) for _, item in one.items))
-
-
 # Strangers
 
 
