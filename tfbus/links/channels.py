@@ -31,11 +31,11 @@ QUIET: Final = "none"
 """Only signs of life go there, for a link that asks lookups and wants nothing else."""
 MOST_FILTERS = 100
 LONGEST_FILTER = 2**16
-"""Bytes; a link with more names hears all, and leaves out what it does not want."""
+"""Bytes; a link whose names take more receives all frames, and drops the unwanted ones."""
 FULL_MESSAGE = 5_000
 """A message with so many samples and removals is full; the batch that fills it is still whole."""
 _FORGOTTEN = 30.0
-"""s; so long a filter that nobody hears is kept."""
+"""s after which a filter without listeners is forgotten."""
 _PER_MESSAGE = 1_000
 
 
@@ -99,7 +99,7 @@ class Channels:
         self._time: int | None = None
 
     def serve(self, frames: frozenset[str], now: float) -> None:
-        """Publish a filter from now on; beyond `MOST_FILTERS` everything goes to those that hear it."""
+        """Publish a filter from now on; beyond `MOST_FILTERS`, its listeners receive everything."""
         name = filter_name(frames)
         if name in self._filters or name == ALL:
             return

@@ -43,18 +43,17 @@ from tfbus.tf_message import MalformedMessageError
 SIGN_PERIOD = 1.0
 SIGN_PERIOD_EACH = 0.05
 LONGEST_SIGN_PERIOD_EACH = 0.1
-"""s; a link signs so long after it has sent something or met a peer, and then after twice that time, up to the longest.
-
-A sign goes to all peers, so a link with many of them signs less often: both times are at least so much for each peer.
-"""
+"""s; a link signs `SIGN_PERIOD` after it has sent something or met a peer, and then after twice that time each time, up
+to the `rest` of its wire. A sign goes to all peers, so with many peers the first and the longest period are at least
+`SIGN_PERIOD_EACH` and `LONGEST_SIGN_PERIOD_EACH` for each peer."""
 SOONEST_SIGN = 0.05
-"""s; no two signs follow each other faster, whatever changes."""
+"""s; the shortest time between two signs."""
 MOST_QUESTIONS = 1_000
-"""So many questions for changes or the past may wait for an answer, one of each kind of each link."""
+"""The most questions, for changes or the past, that wait for an answer: one of each kind from each link."""
 MOST_ROBOTS = 100
-"""So many robots are remembered of which no link is there."""
+"""The most robots without a link whose copies are kept."""
 MOST_WAITING = 10_000
-"""So many links wait until a place of a peer is free."""
+"""The most links that wait until a peer leaves."""
 _LARGEST_GAP = 2**32
 _URGENT = frozenset(Kind) - {Kind.LIVE, Kind.SIGN}
 _FOLLOWS = frozenset({Kind.MEETING, Kind.ANSWER, Kind.PAST})
@@ -71,10 +70,10 @@ class DomainEnd(Endpoint):
     robot : str
         The robot whose frames this bus brings; empty without one.
     robots : dict of str to float
-        Patterns of the robots that are heard, each with a rate in Hz; infinite for everything, 0 for nothing but who is
-        there.
+        Patterns of the robots that are heard, each with a rate in Hz; infinite for everything, 0 for presence and
+        lookups only.
     slow_rate : float
-        How often the newest samples go to those that hear less than all, in Hz.
+        How often the newest samples go to links that hear this one at a finite rate, in Hz.
     history : float or None
         How many seconds of the past each new peer is asked for.
     now : callable
@@ -121,9 +120,9 @@ class DomainEnd(Endpoint):
         self._history = HistoryAsker(history or 0.0, self._ask_past, now)
         self.lookups = RemoteLookups(wire.send, name)
         self._news: dict[str, bool] = {}
-        # The last sign of each peer of which nothing is wanted: the same sign once more need not wake the event loop.
+        # The last sign of each peer that agrees with this link: the same sign once more need not wake the event loop.
         self._resting: dict[str, bytes] = {}
-        # Answers take half of the time of the event loop at most.
+        # Answering takes half of the event loop's time at most.
         self._questions: dict[tuple[str, Kind], bytes] = {}
         self._answers_due = -inf
         self._waiting: dict[str, Joined] = {}
@@ -277,7 +276,7 @@ class DomainEnd(Endpoint):
         return [(origin, path) for origin, path in besides.items() if len(path) < LONGEST_WAY][:255]
 
     def _meet(self, peer: Peer) -> None:
-        """Tell a new peer what this link brings, or that it is much."""
+        """Send a new peer the entries that this link brings, or an empty meeting if they are too many."""
         self.send()
         claim = self.own.claim(self._now())._replace(partial=self.frames is not None)
         out = Outgoing(Kind.MEETING, self.relay.origin, 0, claim, self.time, self._reach(), self._serves)
@@ -311,7 +310,7 @@ class DomainEnd(Endpoint):
                 peer.rate = next((rate for one, rate in self._rates.items() if one.matches(peer.robot)), inf)
                 self._meet(peer)
                 self._sign_sooner()
-                # Nothing is wanted of a robot of rate 0 but answers to lookups.
+                # A robot of rate 0 only answers lookups.
                 if peer.rate:
                     # A peer hears of a filter by the first question.
                     self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
@@ -340,7 +339,7 @@ class DomainEnd(Endpoint):
 
     def _answer_due(self, sender: str, question: "_Due") -> None:
         fields = read_fields(question.data)
-        # An answer must not overtake a batch that has gathered.
+        # An answer must not overtake a batch in the outbox.
         self.send()
         if question.kind is Kind.QUESTION:
             self._answer(sender, fields)
@@ -406,7 +405,7 @@ class DomainEnd(Endpoint):
                 size = len(entry.samples)
                 if not self._admit_number(peer, entry.sequence, size):
                     continue
-                # An answer may tell of buses that the peer does not lead to; they are not the peer's.
+                # The authorities of a bus beyond the peer do not count as the peer's.
                 others = entry.origin not in peer.paths
                 if not others and not self._admit_authorities(peer, entry.authorities, size):
                     continue
@@ -430,7 +429,7 @@ class DomainEnd(Endpoint):
     def _note(
         self, replica: Replica, provenance: Provenance, samples: list[ReceivedTransform], live: bool
     ) -> list[ReceivedTransform]:
-        """Note the samples of a batch; returns those that are to be published if they are news."""
+        """Note the samples of a batch in a copy; returns the samples that the relay has to judge."""
         samples = self._wanted(samples)
         rank, peer = provenance.rank, provenance.peer
         if provenance.origin == self.relay.origin or (live and replica.note_moving(samples, rank)):
@@ -444,7 +443,7 @@ class DomainEnd(Endpoint):
                 assert peer is not None
                 self.reject(peer.id, "too many frames", error)
                 continue
-            # Of a moving frame, every live sample counts; the relay knows which of them have come before.
+            # A late live sample of a moving frame belongs to its history; the relay knows which samples came before.
             if is_new or (live and not static and _moves(replica.entries[child])):
                 kept.append(sample)
         return kept
@@ -488,7 +487,7 @@ class DomainEnd(Endpoint):
         self._count(peer.id, offered, published, refused)
 
     def _admit_number(self, peer: Peer, number: int, count: int) -> bool:
-        """Refuse a number that no bus can have given; else all later ones of its origin would be no news."""
+        """Refuse a number that no bus can have reached; it would make all later numbers of its origin old."""
         if self.relay.is_plausible(number):
             return True
         error = ValueError(f"a batch with the number {number}, which is too far ahead of all others")
@@ -496,11 +495,11 @@ class DomainEnd(Endpoint):
         return False
 
     def _count_gap(self, peer: Peer, number: int, live: bool) -> bool:
-        """Count the live messages that have not come; returns whether there are any."""
+        """Count the live messages that are missing before this number; returns whether there are any."""
         if not number:
             return False
         missing = number - peer.number - live
-        # Nobody has sent so many messages: a larger gap means that one of the two numbers is made up.
+        # No link sends so many messages: a larger gap means that one of the two numbers is forged.
         if abs(missing) > _LARGEST_GAP:
             peer.number = number
             return True
@@ -545,7 +544,7 @@ class DomainEnd(Endpoint):
         return frames
 
     def _forget(self, peer: Peer) -> set[bytes]:
-        """Forget a peer; returns the buses that no way leads to any more."""
+        """Forget a peer; returns the buses that are no longer reached."""
         self._end_history(peer.id)
         self._agreement.left(peer.id)
         self.lookups.left(peer.id)
@@ -558,7 +557,7 @@ class DomainEnd(Endpoint):
         return lost
 
     def _update_ways(self, peer: Peer, heard: Heard) -> None:
-        """Note which buses a peer leads to: its own, and by a sign all that it tells."""
+        """Note the buses that a peer leads to: its own bus, and those in its sign."""
         own = self.relay.origin
         if heard.kind in (Kind.SIGN, Kind.MEETING):
             told = {bus: (heard.bus, *path) for bus, path in heard.reach if bus != own and own not in path}
@@ -581,7 +580,7 @@ class DomainEnd(Endpoint):
             self._show(peer, set(opened))
 
     def _show(self, peer: Peer, buses: Collection[bytes]) -> None:
-        """Publish what the copies hold of buses to which a way leads again."""
+        """Publish the entries of buses that are reached again."""
         batches = [
             (Provenance(entry.origin, entry.number, self, peer), [entry.sample])
             for replica in (self._replicas.values() if buses else ())
@@ -646,12 +645,12 @@ class DomainEnd(Endpoint):
                 self._end_history(peer.id)
 
     def _end_history(self, peer: str, lost: Peer | None = None) -> None:
-        """Publish what waited for the past of a peer, with it or without it; the peer may be lost."""
+        """Stop waiting for the past of a peer, and publish its live messages that were held back."""
         known = lost or self.peers.get(peer)
         if peer in self._history.open:
             held = self._history.end(peer)
             if known is not None:
-                # The newest samples that were told meanwhile, if no past has come.
+                # Without an answer, the newest samples of the peer were not published yet.
                 self._show(known, set(known.paths))
                 for heard in held:
                     self._take_held(known, heard)

@@ -36,16 +36,16 @@ class Host(Protocol):
     """The event loop and the link, as an end needs them."""
 
     def receive(self, item: Received) -> None:
-        """Have an item handled on the event loop; for any thread."""
+        """Handle an item later, on the event loop; for any thread."""
 
     def send_soon(self, pending: int) -> None:
-        """Have `Endpoint.send` called at the end of the turn of the event loop; so many samples wait."""
+        """Call `Endpoint.send` at the end of the turn of the event loop; `pending` samples wait."""
 
     def is_behind(self) -> bool:
         """Whether items wait to be handled."""
 
     def stir(self) -> None:
-        """Have `Endpoint.work` called before the time that it has returned."""
+        """Call `Endpoint.work` earlier than at the time that it has returned."""
 
 
 class Endpoint(Outbox):
@@ -162,14 +162,14 @@ class Endpoint(Outbox):
         self._notify()
 
     def send(self) -> None:
-        """Hand to the network all that has gathered, if there is anything."""
+        """Hand the gathered entries to the network, if there are any."""
         turn = Turn(self._entries, self._take_statics(), self.time if self._time_waits else None)
         self._entries, self.pending, self._time_waits = [], 0, False
         if turn.entries or turn.statics or turn.time is not None:
             self._send(turn)
 
     def work(self) -> float:
-        """Do what is due; returns the time of the next call, in s of the monotonic clock."""
+        """Do the work that is due; returns the time of the next call, in s of the monotonic clock."""
         return inf
 
     def split(self, item: Received) -> Iterator[Any]:
@@ -204,7 +204,7 @@ class Endpoint(Outbox):
         return tuple(sorted(peer.id for peer in self.peers.values() if peer.present))
 
     def reject(self, sender: str, reason: str, error: Exception, count: int = 1) -> None:
-        """Count what was refused of a peer, and tell of the first refusal for each reason."""
+        """Count refused samples or messages of a peer; the first refusal for each reason is logged and announced."""
         self.rejected[reason] += count
         peer = self.peers.get(sender)
         if (self._reported_of_unknown if peer is None else peer.reported).add(reason):
@@ -228,13 +228,13 @@ class Endpoint(Outbox):
         raise NotImplementedError
 
     def _lose(self, peer: Peer) -> tuple[str, ...]:
-        """Forget what a lost peer has brought; returns its frames, sorted."""
+        """Forget the frames of a lost peer; returns them, sorted."""
         raise NotImplementedError
 
     def _join(self, sender: str, robot: str = "") -> Peer | None:
         """Note that a peer is there; returns it if that is new, and there is a place."""
         if sender not in self.peers and len(self.peers) >= MAX_PEERS:
-            # One that has never announced itself has to make room.
+            # A peer that has never announced itself has to make room.
             unannounced = next((peer for peer in self.peers.values() if not peer.present), None)
             if unannounced is not None:
                 self._lose(self.peers.pop(unannounced.id))
@@ -308,8 +308,8 @@ class Endpoint(Outbox):
 class ForeignEnd(Endpoint):
     """The end of a link to a world whose messages have neither origins nor numbers, such as ROS.
 
-    Such a world keeps messages with static frames for late joiners. Of frames that this link has sent before, an echo
-    replaces what is kept, for now another link brings them.
+    Such a world keeps messages with static frames for late joiners. If this link has sent a frame, and the world sends
+    a newer sample of it, the newer sample replaces the kept message.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """The last seconds of moving frames, for a link that joins late and wants to look back.
 
-It asks each peer once, in chunks of whole frames in the order of their names. Live messages of the peer wait meanwhile,
-so that the samples of each frame come in order. The answers have the number of the newest sample of each frame, so a
-sample that comes both live and in an answer is published once.
+The link asks each peer once, in chunks of whole frames in the order of their names. Live messages of the peer wait
+meanwhile, so that the samples of each frame come in order. The answers have the number of the newest sample of each
+frame, so a sample that comes both live and in an answer is published once.
 """
 
 from bisect import bisect_right
@@ -19,19 +19,19 @@ from tfbus.stamps import from_seconds
 from tfbus.tree.history import FrameHistory
 
 CHUNK = 2_000
-"""So many samples are told at once, or those of one frame if they are more."""
+"""The most samples in one answer, unless a single frame has more."""
 MOST_OF_FRAME = 2_000
-"""So many samples of one frame are told, the newest."""
+"""The most samples of one frame in an answer, the newest."""
 LONGEST_HISTORY = 3_600.0
 """s."""
 MOST_HELD = 1_000
-"""So many live messages of one peer wait for what it tells; then it is not asked for more."""
+"""The most live messages of one peer that wait for its past; then the link asks the peer for no more."""
 MOST_HELD_SAMPLES = 100_000
-"""So many samples and removals wait in the messages of all peers together; further messages do not wait."""
+"""The most samples and removals in the waiting messages of all peers together; further messages do not wait."""
 PATIENCE = 5.0
-"""s; so long they wait for one answer."""
+"""s; the longest wait for one answer."""
 MOST_REMEMBERED = 10_000
-"""So many peers are remembered as asked."""
+"""The most peers that are remembered as asked."""
 
 
 def chunk_of_past(
@@ -46,10 +46,10 @@ def chunk_of_past(
     relay : Relay
         The relay of the bus.
     replica : Replica
-        The link's copy of what it brings.
+        The copy of the frames that the link brings.
     seconds : float
     after : str
-        The samples are those of the frames whose names come after this one, as far as a chunk holds them.
+        The chunk begins with the first frame whose name comes after this one.
     """
     frames = replica.moving()
     told: list[OutgoingBatch] = []
@@ -104,7 +104,7 @@ class _Open:
 
 
 class HistoryAsker:
-    """Asks each peer once for its last seconds, and holds back what it sends live meanwhile.
+    """Asks each peer once for its last seconds, and holds back its live messages meanwhile.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class HistoryAsker:
     Attributes
     ----------
     open : dict
-        Has the peers of which an answer is awaited, by their ids.
+        The open questions, by the ids of the asked peers.
     """
 
     def __init__(self, seconds: float, ask: Callable[[str, float, str], object], now: Callable[[], float]) -> None:
@@ -165,7 +165,7 @@ class HistoryAsker:
         return True
 
     def end(self, peer: str) -> list[Heard]:
-        """Await no answer of a peer any more; returns what was held back."""
+        """Stop waiting for the answer of a peer; returns its messages that were held back."""
         waiting = self.open.pop(peer, None)
         if waiting is None:
             return []

@@ -34,23 +34,22 @@ from tfbus.tree.lookup import Hold, policy_of
 
 _LONGEST_NAME = 200
 _FULL_TURN = 5_000
-"""So many samples and removals are sent at once, before the turn of the event loop ends."""
+"""With so many samples and removals, the outbox is sent before the turn of the event loop ends."""
 MANY = 100
-"""Moving items that wait, beyond which an answer overtakes those of its own sender too."""
+"""While more moving items wait, an answer overtakes the live messages of its own sender too."""
 _MAX_BYTES = 64 * 2**20
 _OVERHEAD = 256
 """Bytes that an item takes besides its content."""
 FAR: Final = 10.0
-"""s; a time that is further ahead is a jump, because to run all timers up to it would take long."""
+"""s; a stamp that is further ahead is a jump, because running all timers up to it would take long."""
 
 
 class ReceiveQueue:
     """Holds what threads have received until the event loop reads it.
 
-    Items are read in order, but urgent ones, which bring two ends to agree, are read first: where nobody has time, the
-    others may wait for seconds. All that waits of a peer is read before its end, for it was sent before that, and
-    before its answer, which would else split batches. Only while more than `MANY` moving items wait, the answer does
-    not wait for them.
+    Items are read in order, but the urgent ones first: they bring two ends to agree, and on a busy machine the other
+    items wait for seconds. The messages of a peer are read before its `Presence.LEFT`, and before its answer, which
+    would split batches otherwise. Only while more than `MANY` moving items wait, an answer overtakes them.
 
     Parameters
     ----------
@@ -128,7 +127,7 @@ class ReceiveQueue:
         return item
 
     def _hurry(self, sender: str) -> None:
-        """Have all that waits of a peer read before what waits of others."""
+        """Move the waiting items of a peer in front of those of other peers."""
         for queue in (self._kept, self._pending):
             waiting = list(queue)
             queue.clear()
@@ -143,8 +142,8 @@ def _footprint(item: Received) -> int:
 class ClockFollower:
     """Drives a `SimulatedClock` by the stamps that are heard; nothing is polled.
 
-    The clock jumps to the first stamp, to one before the last, and to one that is more than `FAR` ahead. To all others
-    it advances, so that timed tasks run in their order. Nobody else may advance the clock.
+    The clock jumps to the first stamp, to a stamp before the last one, and to a stamp that is more than `FAR` ahead. To
+    all other stamps it advances, so that timed tasks run in their order. No other task may advance the clock.
 
     Parameters
     ----------
@@ -169,7 +168,7 @@ class ClockFollower:
             self._heard.set()
 
     async def run(self) -> None:
-        """Advance the clock to what is heard, until cancelled.
+        """Advance the clock to the stamps that are heard, until cancelled.
 
         Raises
         ------
@@ -352,7 +351,7 @@ class Link:
             return
 
     def send_soon(self, pending: int) -> None:
-        """Send what has gathered at the end of this turn of the event loop. Called by the end."""
+        """Send the gathered entries at the end of this turn of the event loop. Called by the end."""
         if pending >= _FULL_TURN:
             self._end.send()
             return
@@ -367,7 +366,7 @@ class Link:
         return self._whole is not None or len(self._receive_queue) > 0
 
     def stir(self) -> None:
-        """Look again what is due. Called by the end."""
+        """Call `Endpoint.work` soon. Called by the end."""
         if self._stirred is not None:
             self._stirred.set()
 
@@ -379,8 +378,8 @@ class Link:
                 await self._stirred.wait()
 
     def _handle_received(self) -> None:
-        # The first item takes many times as long as the next ones where other processes have used the caches since the
-        # last turn; with the budget spent on it alone, a crowded machine would never be done.
+        # After other processes have used the caches, the first item takes many times as long as the next ones. The
+        # budget leaves it out: on a crowded machine it alone would spend all of it.
         if not (self._attached and self._handle_part()):
             return
         self._budget.begin()
@@ -453,21 +452,21 @@ class DomainLink(Link):
         at most at this rate and at the `slow_rate` of its links. `math.inf` is for everything, and 0 for nothing but
         answers to lookups.
     slow_rate : float
-        How often this link sends the newest sample of each moving frame to those that asked for less than all, in Hz.
+        How often this link sends the newest sample of each moving frame to links that hear it at a finite rate, in Hz.
     frames : iterable of str, optional
         Send and take only these children; by default all. Peers send this link no others, while the names take less
         than 64 kB and a peer has at most a hundred different filters to serve; beyond that they send all.
     drop_lost : bool
-        Whether the frames of a bus leave this one while no way leads to it any more, because its process has ended or
-        was cut off. Otherwise they stay until somebody removes them, here and at whoever joins later.
+        Whether this bus removes the frames of a bus that it does not reach any more, because that process has ended or
+        was cut off. Otherwise they stay until a program removes them, also on buses that join later.
     max_frames : int
         How many frames one bus may have; samples of others are refused and counted.
     capacity : int
         How many live messages may wait for the event loop; then the oldest are dropped and counted.
     history : float, optional
         Ask each peer once, when it is met, for the last so many seconds of its moving frames, as far as buffers on its
-        bus hold them: 2,000 samples of each frame at most. They are published before what it sends live, so lookups at
-        stamps before the joining can be answered.
+        bus hold them: 2,000 samples of each frame at most. They are published before the live samples of the
+        peer, so lookups at stamps before the joining can be answered.
     clock : SimulatedClock, optional
         Follows the time that a peer tells: it advances, and jumps where that time jumps. The first peer that tells a
         time is followed until it is lost; the time of others is refused and counted.

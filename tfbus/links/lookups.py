@@ -1,8 +1,9 @@
 """Lookups in the buffers of other processes: a link asks, and a `BufferServer` of another link answers.
 
-A question goes to one peer of the robot that serves a buffer; its signs of life say so. It waits there as any lookup
-of that buffer does, for `LONGEST_WAIT` at most; then the asker is told what is missing, and asks again if it still
-wants to know. A question that is given up is cancelled there. `tfbus.links.message` checks the bytes of strangers.
+The signs of life of a link say whether it serves a buffer. A question goes to one such peer of the robot, and waits
+there like any lookup of that buffer, for `LONGEST_WAIT` at most. Then the server answers what is missing, and the asker
+asks again if its own timeout has not passed. If the asker gives a question up, it cancels it at the server.
+`tfbus.links.message` checks the bytes of strangers.
 """
 
 import logging
@@ -39,12 +40,12 @@ from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.lookup import Hold
 
 LONGEST_WAIT = 10.0
-"""s; then the asker is told what is missing."""
+"""s; then the server answers what is missing."""
 PATIENCE = 3.0
-"""s; so long an asker waits for a server that it has not met, and for an answer that is late."""
+"""s; the longest wait for a server that has not joined yet, and for an answer that is late."""
 _MOST_SILENCES = 3
 _NUMBER = 8
-"""Bytes of the number of a question, before what it says."""
+"""Bytes of the number before a question or an answer."""
 _ARGUMENTS = "target", "source", "at", "max_age", "source_at", "fixed", "tolerance", "max_gap"
 
 
@@ -60,7 +61,7 @@ class _Pending:
 
 
 class RemoteLookups:
-    """The lookups of one link, those that it asks and those that it is asked.
+    """The remote lookups of one link: its own questions, and the questions of its peers.
 
     Parameters
     ----------
@@ -80,7 +81,7 @@ class RemoteLookups:
         self._send = send
         self._domain = domain
         self._capacity = capacity
-        # Drawn at random, so that nobody guesses the numbers of questions of others.
+        # Drawn at random, so that no peer can guess the numbers of questions to other peers.
         self._first = self._number = int.from_bytes(os.urandom(7), "little")
         self._pending: dict[int, _Pending] = {}
         # The peers that serve a buffer, and their robots.
@@ -110,7 +111,7 @@ class RemoteLookups:
                 self._servers[peer] = robot
             else:
                 del self._servers[peer]
-            # It wakes all that wait now, and none that waits later.
+            # An anyio event stays set, so later waiters need a new one.
             self._changed.set()
             self._changed = anyio.Event()
 
@@ -134,12 +135,12 @@ class RemoteLookups:
             self.server.cancel(asker, number)
 
     def answered(self, peer: str, data: bytes) -> None:
-        """Take an answer of a link: its number, and what it says.
+        """Take an answer of a link: a number, and the answer.
 
         Raises
         ------
         MalformedMessageError
-            If there was no such question; one that was given up is none of these.
+            If no question had this number; an answer to a question that was given up is ignored.
         """
         number = int.from_bytes(data[:_NUMBER], "little")
         if not self._first < number <= self._number:
@@ -241,7 +242,7 @@ class Serving(Protocol):
 class BufferServer:
     """Answers lookups of other processes from a buffer: ``async with BufferServer(buffer, link)``.
 
-    A lookup waits here as any lookup of the buffer does; `DomainLink.lookup` asks. It is what a BufferServer is in tf2.
+    `DomainLink.lookup` asks it. A question waits like any lookup of the buffer. It does the work of tf2's BufferServer.
 
     Parameters
     ----------

@@ -60,21 +60,21 @@ MAX_TEXT = 2**17
 MAX_LOOKUP = 2**16
 """The largest message that is read."""
 MAX_DEPTH = 16
-"""So deep may values stand inside of values; an error with its cause takes two levels."""
+"""The deepest nesting of values; an error with its cause takes two levels."""
 MAX_ENTRIES = 10_000
 MAX_SAMPLES = 10_000
 """The largest batch that is sent or accepted: a bus publishes it in one turn of the loop, all or nothing."""
 LONGEST_WAY = 8
-"""A bus is reached over so many others at most."""
+"""The most buses on the way to a bus."""
 _LARGE = 2**15
 """Bytes; a message beyond is read in parts."""
 _PART = 200
-"""So many samples, or entries, of a large message are decoded, or handled, before other tasks may have their turn."""
+"""The samples or entries of a large message that are handled before other tasks may have their turn."""
 _PART_OF_HEAD = 1_000
 _LONGEST_AUTHORITY = 65_535
 _FIRST_STAMP, _END_OF_STAMPS = -(2**31) * SECOND, 2**31 * SECOND
 _HELD: set[tuple[str, str, str]] = set()
-"""The parents, children and authorities that a message can hold, as far as it was asked of late."""
+"""Parents, children and authorities that a message can hold, of the last calls of `can_hold`."""
 _MOST_HELD = 2_000
 _MOST_DIGITS = 20
 _SHOWN = 200
@@ -202,7 +202,7 @@ def write_text(kind: Kind, fields: dict[str, Any]) -> bytes:
 
 
 def write_body(kind: Kind, body: bytes) -> bytes:
-    """The bytes of a message whose body is somebody else's to read."""
+    """The bytes of a message with this body."""
     return bytes((VERSION, kind)) + body
 
 
@@ -424,7 +424,7 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
     for _ in range(authority_count):
         (length,) = _LENGTH.unpack_from(data, at)
         at += _LENGTH.size
-        # One string for all messages that name it: it may be long, and each sample keeps it.
+        # All messages share one string for each authority: it may be long, and each sample keeps it.
         authorities.append(intern(data[at : at + length].decode()))
         at += length
     entries: list[_Batch | RemovedFrame] = []
@@ -520,7 +520,7 @@ def read_answer(
         answer = _answer_of(_read(data))
         if question is not None and isinstance(answer, TransformStamped):
             _check_answers(answer, question)
-    except Exception as error:  # noqa: BLE001 - whatever a server sends, the asker hears of one error
+    except Exception as error:  # noqa: BLE001 - the asker gets one kind of error for all bad answers
         detail = f"not an answer: {str(error)[:_SHOWN]}"
         return RemoteLookupError(domain=domain, robot=robot, reason="malformed", detail=detail)
     return answer

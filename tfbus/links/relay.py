@@ -1,7 +1,7 @@
-"""The relay of a bus: all its links share it, so that what comes by one goes out by the others, and nothing goes round.
+"""The relay of a bus, which all its links share: it passes samples on between them, and no sample goes round.
 
 Every batch is numbered by the bus on which it was published first, its *origin*. The same batch may arrive on several
-ways, for a bus with two links passes on by each what came by the other. So a sample is news only if its number is
+ways, for a bus with two links passes samples on between them. So a sample is news only if its number is
 higher than that of the newest sample of the same origin and child; then no ring of buses has an echo.
 
 The number of a batch is the machine's time in microseconds, or one more than the highest number that the bus has seen
@@ -10,14 +10,14 @@ physical clocks", 2014). So of two statements on one frame, such as a static sam
 higher number and holds on every bus, in whatever order they arrive: also if the two buses were parted, as far as the
 clocks of their machines agree, and if a program was started again.
 
-Batches of a world that has no origins, such as ROS, get this bus as their origin. Such a world gives back what it was
-sent, by another link of this bus or by another bus, and nothing in it tells. So while a link to such a world is
-attached, the relay remembers the newest samples of each child, and takes the same one for news only once.
+Batches of a world that has no origins, such as ROS, get this bus as their origin. Such a world gives samples back that
+it was sent, by another link of this bus or by another bus, without a mark. So while a link to such a world is attached,
+the relay remembers the newest samples of each child, and takes the same one for news only once.
 
 Outgoing samples gather in the outbox of each link until the turn of the event loop ends.
 
-The relay also counts the ways to each bus, its *reach*: a link with `drop_lost` withdraws the frames of a bus that no
-way leads to any more. They are not removed: see `tfbus.links.replica`.
+The relay also counts the ways to each bus, its *reach*: a link with `drop_lost` withdraws the frames of a bus that is
+not reached any more. They are not removed: see `tfbus.links.replica`.
 """
 
 import os
@@ -39,12 +39,12 @@ from tfbus.rows import Row
 LARGEST_JUMP = 2**52
 """A number may be so far ahead of this machine's time: 142 years in us, for some machines begin in 1970."""
 MANY_PEERS = 20
-"""All origins together may have so many times the frames that one of them may have."""
+"""All origins together may have this many times the frames of one origin."""
 MAX_ORIGINS = 10_000
 MOST_LOST = 1_000
-"""The numbers of so many lost buses are remembered, because copies of their samples may still be on the way."""
+"""The most lost buses whose numbers are remembered, because copies of their samples may still be on the way."""
 _LEAP = 2**16
-"""A bus skips so many numbers behind one that somebody has made up in its name, for the next ones are mostly taken."""
+"""A bus skips so many numbers behind a forged number of its own, because the forger may use the next ones too."""
 _REMEMBERED = 10_000
 _PER_CHILD = 256
 _GONE_CHILDREN = 1_000
@@ -153,14 +153,14 @@ class Outbox:
             self._notify()
 
     def keep(self, entry: OutgoingBatch | RemovedFrame) -> None:
-        """Note what another link knows and is not, or no more, on this bus, for whoever shows it."""
+        """Note an entry that another link knows and this bus does not show, for peers that show it."""
 
     def kept(self) -> Iterable[OutgoingBatch | RemovedFrame]:
-        """All that is known by this link, for another one that begins later."""
+        """The entries that this link knows, for another link that begins later."""
         return ()
 
     def own_sample(self, _frame: str, /) -> TransformStamped | None:
-        """The newest sample of a frame that this bus has to say again if somebody has outnumbered it."""
+        """The newest sample of a frame of this bus, to send again after a forged number has hidden it."""
         return None
 
     def ways(self) -> Iterable[tuple[bytes, tuple[bytes, ...]]]:
@@ -171,7 +171,7 @@ class Outbox:
         """The buses that this one reaches by other links have changed."""
 
     def _notify(self) -> None:
-        """Something was added."""
+        """Note that the outbox has something to send."""
         raise NotImplementedError
 
     def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
@@ -181,7 +181,7 @@ class Outbox:
     def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
         """Note for late joiners that a frame has gone; returns whether anything changes for these.
 
-        There is no rank if the other ends know it, because they have said so or see that its owner was lost.
+        The rank is None if the other ends know of the removal: it came from them, or they see that the owner was lost.
         """
         raise NotImplementedError
 
@@ -325,7 +325,7 @@ class Relay:
         self._passed: PassedSamples | None = None
 
     def attach(self, outbox: Outbox, foreign: bool = False) -> None:
-        """Give a link all that is latched or known by others, and all that is published from now on.
+        """Give a link the latched samples, the entries of the other links, and all samples from now on.
 
         Parameters
         ----------
@@ -393,7 +393,8 @@ class Relay:
         Returns
         -------
         published, refused : int
-            Samples that were published, and samples whose frames are too many; all others are no news.
+            The numbers of samples that were published, and that were refused because they would add too many frames.
+            All other samples were no news.
         """
         news: list[ReceivedTransform] = []
         refused = 0
@@ -450,12 +451,12 @@ class Relay:
                 if not self._bus.closed and latest is not None and latest.peer is peer:
                     self._remove_from_bus(frame, Provenance(self.origin, self._next_number(), outbox, peer))
                     if self._passed is not None:
-                        # The next peer may bring it just as it was.
+                        # The next peer may bring the frame unchanged.
                         self._passed.forget(frame)
         return frames
 
     def say_again(self, frames: Iterable[str]) -> None:
-        """Give those of some frames that are this bus's own new numbers, by which they are news to all others."""
+        """Send the own frames among some frames again, with new numbers, so that they are news on all other buses."""
         own = [frame for frame in sorted(frames) if frame in self._latest and self._latest[frame].origin == self.origin]
         if not own:
             return
@@ -515,7 +516,7 @@ class Relay:
         return sorted(frame for frame, latest in self._latest.items() if latest.origin in origins)
 
     def mask(self, provenance: Provenance, samples: Sequence[TransformStamped]) -> None:
-        """Withdraw frames of which a lost bus was the last to speak, until a way leads to it or others speak."""
+        """Withdraw frames whose newest samples are of a lost bus, until it or another bus brings them again."""
         self._number = max(self._number, provenance.sequence)
         for outbox in self._outboxes:
             if outbox is not provenance.outbox:
@@ -527,7 +528,7 @@ class Relay:
                 self._remove_from_bus(frame, None)
 
     def withdraw(self, frames: Iterable[str], origins: Collection[bytes]) -> None:
-        """Take frames off this bus whose newest sample is of some buses; nothing is said of them to others."""
+        """Take frames off this bus whose newest samples are of some buses; other buses are not told."""
         for frame in frames:
             latest = self._latest.get(frame)
             # A subscriber may have changed things meanwhile.
@@ -543,7 +544,7 @@ class Relay:
         max_frames: int,
         news: list[ReceivedTransform],
     ) -> int:
-        """Add the samples of one batch that are news; returns how many others are of frames that are too many."""
+        """Append the news of one batch to `news`; returns how many samples would add too many frames."""
         refused, before = 0, len(news)
         peer = provenance.peer
         assert peer is not None
@@ -590,7 +591,7 @@ class Relay:
         try:
             self._bus.remove_frame(frame)
         except UnknownFrameError:
-            # It was never on this bus, or the bus forgot it when its clock jumped back, but others have it.
+            # The frame was never on this bus, or was forgotten when its clock jumped back; the other buses have it.
             self._on_removal(frame)
         finally:
             self._removing = None
@@ -647,7 +648,7 @@ class Relay:
         """Forget what holds for a frame that has gone, by a removal or, without one, because its owner was lost."""
         self._settled.pop(frame, None)
         if self._passed is not None:
-            # A sample that was withdrawn may come again just as it was.
+            # A withdrawn sample may come again unchanged.
             (self._passed.forget if provenance is None else self._passed.retire)(frame)
         if provenance is not None:
             self._removed.pop(frame, None)
@@ -658,9 +659,10 @@ class Relay:
             self._release(origin, frame)
 
     def _forget_lost(self) -> bool:
-        """Forget the numbers of the half that was lost first, but for those of frames that are here; False without any.
+        """Forget the numbers of the buses that were lost first, half of all lost buses; False if none is lost.
 
-        They are not forgotten when a bus is lost, because a copy of its samples may come later and would be news again.
+        Numbers of frames on this bus stay. The numbers of a bus are kept when it is lost, because a copy of its samples
+        may come later and would be news again.
         """
         gone = set(islice(self._lost, (len(self._lost) + 1) // 2))
         for origin in gone:
@@ -683,7 +685,7 @@ class Relay:
             del self._held[origin]
 
     def _is_outranked(self, sample: ReceivedTransform, rank: Rank) -> bool:
-        """Whether something else that was said of the frame holds: a removal, or a static sample of another bus."""
+        """Whether a removal, or a static sample of another bus, of a higher rank holds for the frame."""
         _, child, _, _, _, static = sample._fields
         if rank < self._settled.get(child, LOWEST) or rank < self._removed.get(child, LOWEST):
             return True
@@ -695,7 +697,7 @@ class Relay:
         return self._number
 
     def _outnumber(self, number: int, frames: Iterable[str]) -> None:
-        """If a number of this bus is made up, skip past it, and say again what it has masked."""
+        """Skip past a forged number of this bus, and send the frames again that it has hidden."""
         if number > self._number:
             self._number = number + _LEAP
         latest = ((frame, self._latest.get(frame)) for frame in frames)
@@ -762,7 +764,7 @@ class PassedSamples:
         self._gone.pop(child, None)
 
     def retire(self, child: str) -> None:
-        """Remember a child that has left the bus only while few others leave: copies of its samples may be late."""
+        """Keep the samples of a child that has left the bus, until many more have left: copies may come late."""
         if child not in self._keys:
             return
         self._gone.pop(child, None)

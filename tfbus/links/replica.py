@@ -8,6 +8,10 @@ order of arrival: a last-writer-wins map (Shapiro, Preguica, Baquero and Zawirsk
 types", 2011). Every link that holds an entry can pass it on, not only its author. The copy also holds entries that its
 bus refuses.
 
+The *newest* moving sample is the one that was published last. A buffer orders samples by their stamps instead, which
+is the same unless a program publishes an older stamp later. Then the map holds the older stamp: so a recording that is
+played again, and a simulation that starts again, reach the buses that join later.
+
 Messages
 --------
 Live messages carry samples and removals as they happen. They are numbered, and never repeated. The other messages below
@@ -30,12 +34,12 @@ entries, so a frame that moves many times a second does not make copies differ.
 
 1. A sign with the digest of one's own copy needs nothing: what that copy holds up to its sequence is here.
    A copy of some frames only is compared over these, once its link has asked for them.
-2. Where digests differ, and the other sequence is beyond what is known of that copy, the link asks it a little later,
-   if they differ still. A missing number among the live messages is a reason to ask it soon, whatever the digests.
-3. A link that has not read all that has come puts its questions off, for what is missing may be there already; else
-   those that are busy would make each other busier.
-4. There is one question at a time. Answers are bounded, and the next one is asked for behind the last, up to the
-   newest. Answers without news make the next question to that link wait twice as long.
+2. If the digests differ, and the sequence in the sign is beyond the last one seen of that copy, the link asks the peer
+   a little later, if they differ still. If a number is missing among its live messages, the link asks the peer soon.
+3. A link with unread messages puts its questions off, because the missing entries may be among them. Otherwise busy
+   links would make each other busier.
+4. A link asks one question at a time. Answers are bounded, and the next question begins where the last answer ended.
+   After an answer without news, the next question to that peer waits twice as long.
 5. A link that starts asks the first one that it meets for all at once.
 
 So all copies agree some seconds after any trouble, without one digest for each peer and without a leader.
@@ -75,27 +79,27 @@ from tfbus.links.relay import OutgoingBatch, Rank, RemovedFrame
 SETTLING = 1.5
 """s; a frame that moves less often than that is in the digests between its samples."""
 CHUNK = 500
-"""So many entries are told at once."""
+"""The most entries in one answer."""
 MOST_REMOVALS = 10_000
-"""So many removals are remembered, those of the highest ranks."""
+"""The most removals that are remembered, those of the highest ranks."""
 MANY_ORIGINS = 20
-"""All buses together may have so many times the frames that one of them may have."""
+"""All buses together may have this many times the frames of one bus."""
 MOST_REMEMBERED = 1_000
-"""So many lost peers are remembered, with what was known of their copies."""
+"""The most lost peers whose last known sequences are remembered."""
 PATIENCE = 3.0
-"""s; so long a link waits for an answer."""
+"""s; the longest wait for an answer."""
 LONGEST_DELAY = 10.0
-"""s; so long a link that has no time to read puts all its questions off, and then asks one."""
+"""s after which a link with unread messages asks one of the questions that it has put off."""
 _LONGEST_PAUSE = 60.0
 _PAUSE_OF_UNKNOWN = 4.0
-"""s; the longest pause before a link with a filter that has said nothing yet is asked again, for each such link."""
+"""s; the longest pause before a filtered link asks a peer again that has not signed yet, for each such peer."""
 _ASK_AGAIN = 30.0
 _SPARE = 1_000
 _NEVER = -inf
 
 
 class Entry(NamedTuple):
-    """The newest that was said of one frame.
+    """The newest statement on one frame: a sample or a removal.
 
     Attributes
     ----------
@@ -125,7 +129,7 @@ class Claim(NamedTuple):
     final : bool
         Whether `sequence` is the newest.
     partial : bool
-        Whether the sender's copy is of some frames only, so that it says nothing of others.
+        Whether the sender's copy has only some frames.
     """
 
     since: int
@@ -150,7 +154,7 @@ class Places:
     Attributes
     ----------
     held : Counter
-        How many frames each origin has, but for the own one.
+        How many frames each origin has, except the own one.
     taken, removals : int
         How many frames and removals there are.
     """
@@ -183,7 +187,7 @@ class Replica:
         self._places = Places(max_frames) if places is None else places
         self._own = own
         self.entries: dict[str, Entry] = {}
-        # A heap of the removals, the lowest ranks first; what was said of a frame since leaves its removal there.
+        # A heap of the removals, the lowest ranks first; a removal stays in it for a while after a newer entry.
         self._removals: list[tuple[Rank, str]] = []
         self._removed = 0
         # Frames whose entries have changed since the last claim and are to settle first.
@@ -208,7 +212,7 @@ class Replica:
             None for a removal.
         ours : bool
         settles : bool
-            Whether it may change again in a moment: a live sample of a moving frame.
+            Whether the entry may change again in a moment: it is a live sample of a moving frame.
 
         Raises
         ------
@@ -232,7 +236,7 @@ class Replica:
         if settles:
             self._fresh[frame] = None
         else:
-            # At once, because a hundred thousand that wait for the next claim would take a turn of seconds.
+            # Numbered at once, because a hundred thousand entries at the next claim would take a turn of seconds.
             self._fresh.pop(frame, None)
             self._unsettled.pop(frame, None)
             self._number(frame, settled=True)
@@ -244,7 +248,7 @@ class Replica:
         return True
 
     def note_moving(self, samples: Sequence[TransformStamped], rank: Rank) -> bool:
-        """Take in live samples of frames that go on moving; returns False at the first that is none.
+        """Take in live samples of frames that go on moving; returns False at the first other sample.
 
         It does what `note` does for each, in a third of the time: nearly all samples are of this kind.
         """
@@ -278,14 +282,14 @@ class Replica:
     def changes(
         self, since: int, now: float, frames: Collection[str] | None = None, limit: int = CHUNK
     ) -> tuple[list[OutgoingBatch | RemovedFrame], Claim]:
-        """The oldest changes behind a sequence, and the claim that they are.
+        """The oldest changes behind a sequence, and the claim that goes with them.
 
         A sequence that the copy has not reached gives the beginning of all that it holds: a claim since 0. Entries that
         have not settled are among the changes.
         """
         self._settle(now)
         for frame in self._unsettled:
-            # Numbered now to be told in order, and once more when it settles, for others do not hear this answer.
+            # Numbered now for the order of this answer, and again when it settles, for the links without this answer.
             if frame not in self._sequences:
                 self._number(frame)
         if since > self._sequence:
@@ -368,7 +372,7 @@ class Replica:
         return self._removed > MOST_REMOVALS or self._places.removals > MANY_ORIGINS * MOST_REMOVALS
 
     def _settle(self, now: float) -> None:
-        """Number the changes that have settled, and take those that have not out of the digest."""
+        """Number the settled changes, and take the unsettled ones out of the digest."""
         for frame in self._fresh:
             self._digest ^= self._digests.pop(frame, 0)
             self._sequences.pop(frame, None)
@@ -396,7 +400,7 @@ class Replica:
             self._digests[frame] = digest
 
     def _forget_removals(self) -> None:
-        """Forget removals beyond the bound: those of the lowest ranks, so that all copies forget the same ones."""
+        """Forget the removals of the lowest ranks beyond the bound, so that all copies forget the same ones."""
         while self._removed and self._too_many_removals:
             rank, frame = heapq.heappop(self._removals)
             if self._is_removed(frame, rank):
@@ -449,9 +453,9 @@ class _Copy:
 
     def __init__(self, replica: Replica, seen: int, must_ask: bool) -> None:
         self.replica = replica
-        # The frames that it is about, if it is of some only.
+        # The frames of the copy, if it has only some.
         self.frames: Collection[str] | None = None
-        # It is asked again then, if no sign comes before, because it may not serve the filter.
+        # The time of the next question if no sign comes before: the peer may not serve the filter.
         self.again = inf
         self.must_ask = must_ask
         # All changes up to this sequence are here.
@@ -467,14 +471,14 @@ class _Copy:
 
 
 class Question(NamedTuple):
-    """A question that is due: what has changed in the copy of a peer since a sequence."""
+    """A question that is due: the changes in the copy of a peer since a sequence."""
 
     peer: str
     since: int
 
 
 class Agreement:
-    """Decides whom a link asks for what, so that its copies come to agree with those of its peers; see above.
+    """Decides which peer a link asks next, so that its copies come to agree with the copies of its peers; see above.
 
     Nothing here knows an event loop: the caller hands in each time, in s of a monotonic clock.
     """
@@ -484,7 +488,7 @@ class Agreement:
         self._remembered: dict[str, tuple[Replica, int]] = {}
         self._asked: Question | None = None
         self._patience = _NEVER
-        # One of the questions that were put off is asked then.
+        # The time at which one of the questions that were put off is asked.
         self._latest = inf
         self._is_new = True
 
@@ -497,7 +501,7 @@ class Agreement:
             copy.due, copy.missed, copy.urgent = now, True, True
 
     def filters(self, peer: str, frames: Collection[str]) -> None:
-        """The copy of a peer is of these frames only, which are among those of the own copy."""
+        """Note that the copy of a peer has only these frames, which the own copy has too."""
         copy = self._copies.get(peer)
         if copy is not None:
             copy.frames = frames
@@ -514,7 +518,7 @@ class Agreement:
             self._is_new = self._is_new or not any(other.seen for other in self._copies.values())
 
     def told(self, peer: str, claim: Claim, now: float, soon: bool = False) -> None:
-        """A sign of a peer says what its copy is; with `soon`, what is missing is to be asked for at once."""
+        """Take the claim in a sign of a peer; with `soon`, ask for missing entries at once."""
         copy = self._copies.get(peer)
         if copy is None or (claim.partial and copy.frames is None):
             return
@@ -523,7 +527,7 @@ class Agreement:
         copy.claim = claim
         copy.again = now + _ASK_AGAIN if copy.must_ask else inf
         if copy.silences:
-            # It was stopped or cut off, and speaks again.
+            # The peer was stopped or cut off, and speaks again.
             copy.silences = 0
             copy.due = min(copy.due, now + uniform(0.05, 0.2))
         if not copy.missed and self._agrees(copy, now):
@@ -533,14 +537,14 @@ class Agreement:
             copy.due, copy.urgent = min(copy.due, now + pause), copy.urgent or soon
 
     def missed(self, peer: str, now: float) -> None:
-        """Live messages of a peer did not come."""
+        """Note that live messages of a peer are missing."""
         copy = self._copies.get(peer)
         if copy is not None:
             copy.missed = True
             copy.due = min(copy.due, now + uniform(0.05, 0.2))
 
     def answered(self, peer: str, claim: Claim, news: bool, now: float) -> None:
-        """An answer of a peer, whose entries were noted, has told what a claim says."""
+        """Take the claim of an answer, after its entries were noted."""
         copy, asked = self._copies.get(peer), self._asked
         if copy is None or asked is None or asked.peer != peer or claim.since not in (0, asked.since):
             return
@@ -557,7 +561,7 @@ class Agreement:
             copy.fruitless = 0 if news or self._agrees(copy, now) else min(copy.fruitless + 1, 10)
 
     def unanswered(self, peer: str, now: float) -> None:
-        """A peer has not answered."""
+        """Note that a peer has not answered."""
         copy = self._copies.get(peer)
         if self._asked is not None and self._asked.peer == peer:
             self._asked = None
@@ -571,7 +575,7 @@ class Agreement:
         ----------
         now : float
         is_behind : bool
-            Whether the link has not read all that has come.
+            Whether the link has unread messages.
         """
         if self._asked is not None:
             if now < self._patience:
@@ -598,7 +602,7 @@ class Agreement:
             copy.seen = max(copy.seen, 0 if copy.claim is None else copy.claim.sequence)
 
     def rests(self, peer: str, now: float) -> bool:
-        """Whether nothing is wanted of a peer, so that its last sign would say nothing if it came once more."""
+        """Whether the copies agree and no question to a peer is open, so that the same sign again needs no work."""
         copy = self._copies.get(peer)
         return (
             copy is not None
@@ -622,7 +626,7 @@ class Agreement:
         copy.missed = True
         longest = _LONGEST_PAUSE
         if copy.must_ask and copy.claim is None:
-            # It may not know the filter, and then it signs on no channel that is heard here.
+            # The peer may not know the filter; then it signs on no channel that this link hears.
             longest = min(longest, _PAUSE_OF_UNKNOWN * sum(each.claim is None for each in self._copies.values()))
         copy.due = now + min(uniform(0.3, 0.7) * 2**copy.silences, longest)
 

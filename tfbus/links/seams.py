@@ -1,7 +1,8 @@
 """The seams below a link: a wire to buses of tfbus, or a carrier to another world. An author of either reads this page.
 
-A link of tfbus decides what is said, to whom and when, and what is news (`tfbus.links.domain`). Its `Wire` knows one
-network: it moves bytes between the links of one domain, and says which links are there. A new network is one class.
+A link of tfbus decides what it sends to which link, and which samples are news (`tfbus.links.domain`). Its `Wire`
+knows one network: it moves bytes between the links of one domain, and tells which links are present. A new network is
+one class.
 
 Another world, such as ROS, has messages of its own. A link to it (`tfbus.links.endpoint.ForeignEnd`) decides what goes
 out and what is news as well; its `Carrier` writes and reads the messages of that world.
@@ -59,18 +60,18 @@ class Hearing(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Joined:
-    """A link that this one means to hear is there; what was sent to it before may be lost."""
+    """A link that this one hears is present; messages that were sent to it before may be lost."""
 
     robot: str
 
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """A link is there no more. Nothing of it follows, unless it joins again."""
+    """A link has left. No item of it follows, unless it joins again."""
 
 
 WireItem = bytes | Joined | Left | MalformedMessageError
-"""An item that a wire brings of one link; the error is for a message that the wire has refused."""
+"""An item that a wire receives from one link; the error is for a message that the wire has refused."""
 Receive = Callable[[str, WireItem], object]
 
 
@@ -85,15 +86,15 @@ class Wire(Protocol):
     id : str
         The name of this link for all others: 32 hexadecimal digits, drawn at random.
     rest : float
-        In s, at least so often a link that has nothing to say repeats what it holds. A network that may lose the last
-        message before a silence without a word needs this soon.
+        The longest time between two signs of life of an idle link, in s. A network that may lose the last message
+        before a silence needs a short one.
     """
 
     id: str
     rest: float = 2.0
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
-        """Join the network, or begin to: where others are not there yet, `run` meets them later.
+        """Join the network, or begin to: `run` meets the links that are not there yet.
 
         Parameters
         ----------
@@ -101,8 +102,8 @@ class Wire(Protocol):
             The first that matches a link's robot is for that link; a link that none matches is not announced, and
             nothing that it publishes comes to this process.
         receive : callable
-            Takes the id of a link, and what has come of it: that it has joined or left, a message that it has published
-            on a channel which this link hears, or one that it has sent to this link. Messages that are sent to this
+            Takes the id of a link and an item of it: that it has joined or left, a message that it has published on a
+            channel which this link hears, or a message that it has sent to this link. Messages that are sent to this
             link come from all links of the domain, announced or not. Any thread may call it, from now until `close`
             has returned and later; it never blocks and never raises. The published messages of one link come in
             their order, and so do the messages that it has sent to this link.
@@ -117,13 +118,13 @@ class Wire(Protocol):
         """
 
     async def run(self) -> None:
-        """Do what takes time, such as connecting to others, until cancelled."""
+        """Do the work that takes time, such as connecting to other links, until cancelled."""
 
     def is_heard(self, channel: str) -> bool:
         """Whether any link may hear a channel of this one; it does not block and does not raise."""
 
     def is_behind(self) -> bool:
-        """Whether something has come that was not read yet, as far as the wire knows; it does not block."""
+        """Whether received bytes wait to be read, as far as the wire knows; it does not block."""
         return False
 
     def publish(self, channel: str, message: bytes) -> None:
@@ -215,7 +216,7 @@ class ReceivedMessage:
 
 
 class SendReport:
-    """Counts what a carrier has sent, and what it could not send; for the event loop only.
+    """Counts the messages and samples that a carrier has sent or could not send; for the event loop only.
 
     Parameters
     ----------
@@ -252,10 +253,10 @@ class SendReport:
 
 
 class Carrier(Protocol):
-    """Carries what a link sends over one network, and brings what comes from there.
+    """Sends the messages of a link over one network, and receives those of its peers.
 
-    The link decides what goes out, what is news and what is refused; a carrier decides how it is written, and keeps
-    static frames for late joiners as its network allows. A carrier is used by one link, and opened once.
+    The link decides which samples go out, are news, or are refused. A carrier writes them, and keeps static frames for
+    late joiners as its network allows. A carrier is used by one link, and opened once.
 
     The event loop calls everything here, in this order: `open`; then, while `run` runs as a task, `send` and `read`;
     when `run` has been cancelled, a last `send` may have come, and `close` is called.
@@ -279,7 +280,7 @@ class Carrier(Protocol):
             Items are handled in the order of the calls, so a peer's `Presence.LEFT` has to be the last of its items. A
             carrier whose network tells nothing of presence leaves presence out.
         report : SendReport
-            Counts what was sent and what could not be; for the event loop only.
+            Counts sent and unsent messages; for the event loop only.
 
         Raises
         ------
@@ -320,7 +321,7 @@ class Carrier(Protocol):
         """
 
     async def run(self) -> None:
-        """Do what takes time, such as declaring what is kept for late joiners, until cancelled; may return early.
+        """Do the work that takes time, such as declaring static frames, until cancelled; may return early.
 
         An error that it raises ends the link's body, as that of any task does.
         """

@@ -1,4 +1,4 @@
-"""`Connection`: the socket between two links, its frames, and what waits for room in it. `Poll` waits for many."""
+"""`Connection`: the socket between two links, its frames, and the queues of a full socket. `Poll` waits for many."""
 
 import hmac
 import re
@@ -163,13 +163,13 @@ class Poll:
             self._ready.set_result(None)
 
     def close(self) -> None:
-        """Wait for nothing any more."""
+        """Stop waiting, and close the file."""
         if self._loop is not None:
             self._loop.remove_reader(self._file)
         self.abandon()
 
     def abandon(self) -> None:
-        """Close the file in a child process, and leave what the parent waits for as it is."""
+        """Close the file in a child process; the parent goes on waiting with its own."""
         self._selector.close()
 
 
@@ -251,7 +251,7 @@ class Connection:
         return True
 
     def _write_at_once(self, frame: bytes) -> bool:
-        """Whether the frame need not wait: it is written, in part at least, or nobody will ever read it."""
+        """Whether the frame need not wait: it is written, in part at least, or the other side has stopped reading."""
         try:
             written = self.sock.send(frame, _FLAGS)
         except BlockingIOError:
@@ -269,7 +269,7 @@ class Connection:
         return written > 0
 
     def flush(self) -> None:
-        """Write what waits, as far as there is room."""
+        """Write the waiting frames, as far as there is room."""
         most = MOST_AT_ONCE
         try:
             while most > 0:
@@ -298,7 +298,7 @@ class Connection:
             self._size_published -= size
 
     def _stop_writing(self) -> None:
-        """Write no more, because the other does not read any more; it is told by the end."""
+        """Write no more, because the other side does not read; the end of the stream tells it so."""
         self._sent.clear()
         self._published.clear()
         self._rest = None
@@ -347,7 +347,7 @@ class Connection:
     # Meeting
 
     def prove(self) -> bytes:
-        """This side's proof that it knows the key: a code over both hellos, of which each has a number of its own."""
+        """This side's proof that it knows the key: a code over both hellos, each with a random number."""
         return self._proof(bool(self.dialled))
 
     def believes(self, proof: bytes) -> bool:
@@ -374,7 +374,7 @@ class Connection:
         self.hears = channel or None
 
     def close(self) -> None:
-        """Close the socket; what waits is lost."""
+        """Close the socket; waiting frames are lost."""
         if not self.closed:
             self.closed = True
             self._room = False

@@ -12,7 +12,7 @@ class LocalLink(DomainLink):
 
     Nothing has to be configured or started, and no port is opened: each two links have a socket in a directory that
     only the user can enter. For other machines there is `tfbus.links.zenoh.ZenohLink`; a bus may have both, and passes
-    on by each what comes by the other.
+    on the samples between them.
 
     Parameters
     ----------

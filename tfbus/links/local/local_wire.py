@@ -38,12 +38,11 @@ fills, then a bounded number of messages waits for it here, and it reads them al
 
 Bounds
 ------
-For each connection wait at most 8 MiB of published messages, of which the oldest are dropped, and 16 MiB of sent ones,
-which go first; a frame whose writing has begun is finished before. A message is at most `MAX_MESSAGE` long; a longer
-one ends its connection. All messages that have begun to arrive have at most 64 MiB together; the one that has not
-grown for the longest time is given up with its connection. There are at most 1,000 connections. Of those that have
-connected and are not met at most 64 are kept, the newest, for 10 s. One turn of the event loop reads for about a
-millisecond.
+Each connection queues at most 8 MiB of published messages, and then drops the oldest, and at most 16 MiB of sent
+messages, which go first; a frame whose writing has begun is finished before. A message is at most `MAX_MESSAGE` long; a
+longer one ends its connection. All unfinished messages have at most 64 MiB together; beyond that, the connection whose
+message has not grown for the longest time is closed. There are at most 1,000 connections. Of the incoming connections
+that are not met, the newest 64 are kept, for 10 s. One turn of the event loop reads for about a millisecond.
 """
 
 import os
@@ -66,9 +65,9 @@ from tfbus.tf_message import MalformedMessageError
 
 MOST_CONNECTIONS: Final = 1_000
 MOST_STRANGERS: Final = 64
-"""So many that have connected here may be not met yet."""
+"""The most incoming connections that are not met yet."""
 MOST_UNFINISHED: Final = 2**26
-"""Bytes of all messages together that have begun to arrive."""
+"""Bytes of all unfinished messages together."""
 PATIENCE: Final = 10.0
 """s until a connection has to be met."""
 READ_BUFFER: Final = 2**17
@@ -96,7 +95,7 @@ class LocalWire(Wire):
         Windows. All links of a domain have to use the same.
     """
 
-    # A connection loses nothing but what waits for too long, and what is said last is kept.
+    # A connection drops only the oldest waiting messages, so the last one before a silence arrives.
     rest = 6.0
 
     def __init__(
@@ -111,12 +110,12 @@ class LocalWire(Wire):
         self._listener: socket.socket | None = None
         self._accepts = False
         self._connections: set[Connection] = set()
-        # The met ones, by the ids of the others and by the channels that these hear.
+        # The met connections, by the ids of the other links and by the channels that those hear.
         self._links: dict[str, Connection] = {}
         self._hearers: dict[str, list[Connection]] = {}
-        # The ones that others have made and that are not met, the oldest first.
+        # Incoming connections that are not met, the oldest first.
         self._strangers: dict[Connection, None] = {}
-        # The ones with the beginning of a message, and its length; the one that has grown last is the last.
+        # The size of the unfinished message of each connection; the message that has grown last is the last.
         self._unfinished: dict[Connection, int] = {}
         self._unfinished_size = 0
         self._dialled: dict[str, Connection] = {}
@@ -238,7 +237,7 @@ class LocalWire(Wire):
         for name in names:
             if name not in self._dialled and name[16:] not in met:
                 if name > self._place.name and name not in self._retries:
-                    # It comes by itself, unless it was killed.
+                    # The younger link connects by itself, unless it was killed.
                     self._retries[name] = (now + _RARELY, _FIRST_RETRY)
                 elif self._retries.get(name, (0.0,))[0] <= now:
                     self._dial(name)
@@ -254,7 +253,7 @@ class LocalWire(Wire):
         try:
             sock, key, connected = self._place.dial(name)
         except (ConnectionRefusedError, FileNotFoundError, BlockingIOError):
-            # It has gone, or has no room for now.
+            # The other link has gone, or has no room for now.
             return
         except OSError as error:
             self._warn_once(error)
@@ -272,7 +271,7 @@ class LocalWire(Wire):
             except (BlockingIOError, ConnectionAbortedError):
                 return
             except OSError as error:
-                # There are too many open files. Connections that are there go on, and the next look tries again.
+                # There are too many open files. Existing connections go on, and the next look tries again.
                 self._warn_once(error)
                 self._poll.remove(self._listener)
                 self._accepts = False
@@ -292,14 +291,14 @@ class LocalWire(Wire):
             connection = Connection(sock, self._poll, self._place.key)
             self._connections.add(connection)
             self._strangers[connection] = None
-            # Mostly the hello is there already, so a crowd that comes at once does not push itself out.
+            # Mostly the hello is there already, so links that connect all at once do not push each other out.
             await self._read(connection, budget)
             await budget.give_way()
 
     # Moving bytes
 
     async def _move(self) -> None:
-        """Read all connections, and write what waits for room."""
+        """Read all connections, and write the frames that wait for room."""
         budget = TurnBudget()
         while True:
             await self._poll.wait()

@@ -3,7 +3,7 @@
 The folder of a domain has one file for each of its links: a Unix socket, or, with `loopback`, a text with the port of
 the loopback at which the link listens and a key. Its name is the time of the link's opening and a part of its id, so
 that any two links agree about which is the younger. A name becomes visible once the link listens, by a rename. So a
-file at which nobody listens belongs to a process that was killed, and the first that finds it removes it.
+file without a listener belongs to a process that was killed, and the first link that finds the file removes it.
 
 The directory is the one that was given, or named by ``TFBUS_RUNTIME_DIR``, or else ``tfbus`` in ``XDG_RUNTIME_DIR``, or
 else ``tfbus-UID`` in the directory for temporary files. It belongs to the user and is closed to all others, which is
@@ -189,7 +189,7 @@ class MeetingPlace:
         Raises
         ------
         OSError
-            If it is not there or has no room; nobody may be there, and then its name is removed.
+            If the link is not there or has no room. If its file has no listener, the file is removed.
         """
         path = self._folder / name
         key, connected = b"", True

@@ -24,9 +24,9 @@ dropped, and no call waits for room longer than zenoh's 50 ms, once each time th
 
 Both kinds of messages have one priority, because zenoh keeps the order only within one.
 
-Access control by a router's rules: ``put`` and ``delete`` on ``tfbus/**`` are what a link publishes,
-``liveliness_token`` on ``tfbus/**/@alive/**`` is that it is announced, and ``put`` on ``tfbus/**/@to/*`` what it sends
-to one link. In zenoh ``**`` stands for no part that begins with ``@``. The id of a sender proves nothing.
+Access control by a router's rules: a link publishes by ``put`` and ``delete`` on ``tfbus/**``, is announced by
+``liveliness_token`` on ``tfbus/**/@alive/**``, and sends to one link by ``put`` on ``tfbus/**/@to/*``.
+In zenoh ``**`` stands for no part that begins with ``@``. The id of a sender proves nothing.
 """
 
 import math
@@ -255,7 +255,7 @@ class ZenohWire(Wire):
         try:
             for channel in channels:
                 session.declare(channel)
-            # The owner may send something to a link as soon as that has joined.
+            # The link may send something to another one as soon as that has joined.
             self._session = session
             session.begin(self._domain, self._number, self._hears, is_router=self._is_router)
         except zenoh.ZError as error:
@@ -272,7 +272,7 @@ class ZenohWire(Wire):
 
 
 class _Session:
-    """One session of a link: what it declares, and what goes out by it."""
+    """One session of a link, with its declarations and publishers."""
 
     def __init__(self, session: zenoh.Session, hearer: "_Hearer", own: str, link: str) -> None:
         self.hearer = hearer
@@ -370,7 +370,7 @@ class _Session:
 
 
 class _Hearer:
-    """Takes all that comes by one session, in zenoh's threads; it holds none of zenoh's objects, which hold it."""
+    """Receives from one session, in zenoh's threads; it holds none of zenoh's objects, because they hold it."""
 
     def __init__(
         self, link: str, domain: str, hears: Sequence[Hearing], receive: Receive, changed: threading.Event
@@ -441,7 +441,7 @@ class _Hearer:
 
 
 def _directly(callback: Callable[[Any], object]) -> Any:
-    """A handler that zenoh's threads call; whatever a stranger's message makes of it, no error leaves it."""
+    """A handler that zenoh's threads call; it suppresses all errors that a stranger's message may cause."""
 
     def call(thing: Any) -> None:
         with suppress(Exception):
