@@ -6,6 +6,8 @@ seen from another, and lets a lookup wait for data that are still on their way. 
 
 from importlib import import_module
 
+__version__ = "0.1.0"
+
 _NAMES_IN = {
     "analysis.examiner": ("Finding", "diagnose"),
     "buffer.buffer": ("Buffer",),
@@ -109,10 +111,6 @@ def __getattr__(name: str) -> object:
         value = getattr(import_module(f"tfbus.{_HOMES[name]}"), name)
     elif name in _ROOMS:
         return import_module(f"tfbus.{name}")
-    elif name == "__version__":
-        from importlib.metadata import version
-
-        value = version("tfbus")
     else:
         raise AttributeError(f"module 'tfbus' has no attribute {name!r}")
     globals()[name] = value

@@ -51,7 +51,7 @@ def compile_kernel(folder: Path) -> None:
     flags = ["/O2", "/fp:precise"] if sys.platform == "win32" else ["-O3", "-g0", "-ffp-contract=off"]
     kernel = Extension(
         "tfbus._kernel",
-        [str((PACKAGE / "_kernel.c").relative_to(Path.cwd()))],
+        [str((PACKAGE / "_c_kernel" / "kernel.c").relative_to(Path.cwd()))],
         extra_compile_args=flags,
         libraries=[] if sys.platform == "win32" else ["m"],
         py_limited_api=True,

@@ -25,6 +25,10 @@ class Sample:
     @property
     def static(self) -> bool: ...
 
+class Columns:
+    def __len__(self) -> int: ...
+    def samples(self, kind: type[Any], /) -> tuple[Any, ...]: ...
+
 class Block: ...
 
 class History:
@@ -139,5 +143,15 @@ class Method:
 def decode(
     body: bytes, at: int, tags: tuple[tuple[str, bool], ...], names: Mapping[bytes, tuple[str, str]], kind: type[Any], /
 ) -> tuple[list[Any], int]: ...
+def columns(
+    parents: str | tuple[str, ...],
+    children: str | tuple[str, ...],
+    stamps: Any,
+    rows: Any,
+    authority: str,
+    static: bool,
+    square: float,
+    /,
+) -> Columns | None: ...
 def commit(frames: Mapping[str, History], batch: tuple[Sample, ...], first: int, /) -> int: ...
 def compose_paths(rows: Any, origins: Any, /) -> None: ...

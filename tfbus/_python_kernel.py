@@ -1,6 +1,6 @@
 """The kernel in Python: samples, edges and paths, and the plain judgement, commit and answer.
 
-This is the definition. ``tfbus/_kernel.c`` does the same, with the same bits, and runs in its place where it could be
+This is the definition. ``tfbus/_c_kernel/`` does the same, with the same bits, and runs in its place where it could be
 built. Both hand back a case that is not plain: the caller then decides, and raises the errors.
 
 The samples are stored by column: stamps for `bisect`, and one 64-byte record a sample (stamp, translation, rotation),
@@ -667,6 +667,23 @@ def decode(
     decodes them all.
     """
     return [], at
+
+
+def columns(
+    parents: str | tuple[str, ...],  # noqa: ARG001
+    children: str | tuple[str, ...],  # noqa: ARG001
+    stamps: Stamps,  # noqa: ARG001
+    rows: npt.NDArray[np.float64],  # noqa: ARG001
+    authority: str,  # noqa: ARG001
+    static: bool,  # noqa: ARG001
+    square: float,  # noqa: ARG001
+) -> Any:
+    """The rows of some columns as a batch, if all are plain; their quaternions are normalised in place.
+
+    A row is plain if its names can name two frames, its quaternion is a unit quaternion within 1 %, and the square of
+    its translation, in m^2, is at most `square`. Here none is: `tfbus.geometry.columns` makes a sample of each.
+    """
+    return None
 
 
 def commit(frames: Mapping[str, History], batch: Sequence[Sample], first: int) -> int:

@@ -3,7 +3,7 @@
 The environment variable ``TFBUS_KERNEL`` asks for ``python`` or ``compiled``. Without it, the compiled kernel runs if
 it was built and can be loaded.
 
-`tfbus._python_kernel` is the definition: ``_kernel.c`` does the same, with the same bits. The fast path of publishing
+`tfbus._python_kernel` is the definition: ``_c_kernel/`` does the same, with the same bits. The fast path of publishing
 exists in C only, because in Python it would not be faster than the ordinary path: `Intake` takes a plain batch, and the
 `Feed` of each buffer stores it and wakes the lookups that waited for it.
 """
@@ -13,8 +13,6 @@ import importlib
 import os
 from collections.abc import Callable
 from typing import Any, Final, Literal, TypeVar, cast
-
-from tfbus.stamps import LATEST
 
 Kernel = Literal["compiled", "python"]
 MethodT = TypeVar("MethodT", bound=Callable[..., Any])
@@ -56,6 +54,7 @@ if kernel == "python":
         Parked,
         Paths,
         Sample,
+        columns,
         commit,
         compose_paths,
         decode,
@@ -75,6 +74,7 @@ else:
         Parked,
         Paths,
         Sample,
+        columns,
         commit,
         compose_paths,
         decode,
@@ -91,6 +91,7 @@ __all__ = [
     "Parked",
     "Paths",
     "Sample",
+    "columns",
     "commit",
     "compose_paths",
     "decode",
@@ -119,6 +120,8 @@ def plain_first(method: MethodT, many: type | None = None) -> MethodT:
         return cast(MethodT, Method(method, many))
     if many is not None:
         return method
+    # Here, because it loads numpy, which `tfbus --version` does without.
+    from tfbus.stamps import LATEST
 
     @functools.wraps(method)
     def first(self: Any, target: str, source: str, at: Any = LATEST, **options: Any) -> Any:

@@ -7,6 +7,7 @@ screws, so that it agrees at the samples only, and it is checked there.
 
 from collections.abc import Callable
 from itertools import pairwise
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import cases
@@ -153,6 +154,55 @@ def test_stamps_in_order_on_both_kernels(table: Table, count: int, read: bool) -
 
 def scattered_points() -> Points:
     return np.random.default_rng(4).uniform(-50.0, 50.0, (POINTS, 3)).astype(np.float32)
+
+
+ROWS = 1_000
+
+
+@pytest.mark.parametrize("into", ["bus", "tree"])
+@pytest.mark.parametrize("shape", ["one frame, many stamps", "many frames, one stamp"])
+def test_samples_from_arrays(table: Table, into: str, shape: str) -> None:
+    """With all checks. The peer stores the stamps of one frame, and checks less."""
+    rng = np.random.default_rng(7)
+    translations, rotations = rng.normal(size=(ROWS, 3)), rng.normal(size=(ROWS, 4))
+    rotations /= np.linalg.norm(rotations, axis=1)[:, None]
+    steps = np.arange(1, ROWS + 1)
+    names = "f0" if shape.startswith("one") else [f"f{i}" for i in range(ROWS)]
+    repeats = 5
+
+    def on(package: Any) -> Turn:
+        def one_turn() -> float:
+            bus, tree = package.Bus(max_behind=None), package.TransformTree()
+            buffer = package.Buffer(bus)
+            store = bus.publish_columns if into == "bus" else tree.insert_columns
+            store(BASE, names, START if isinstance(names, list) else START - ROWS + steps, translations, rotations)
+            start = perf_counter()
+            for turn in range(1, repeats + 1):
+                stamps = START + turn * ROWS + (0 if isinstance(names, list) else steps)
+                store(BASE, names, stamps, translations, rotations)
+            seconds = perf_counter() - start
+            assert (buffer.tree if into == "bus" else tree).inserted == (repeats + 1) * ROWS
+            bus.close()
+            return seconds / ROWS / repeats
+
+        return one_turn
+
+    peer = None
+    if isinstance(names, str):
+        tf_tree = pytest.importorskip("tf_tree")
+        wxyz = np.hstack((rotations[:, 3:], rotations[:, :3], translations))
+
+        def theirs() -> float:
+            built = tf_tree.build([(BASE, "f0")], capacity=8 * ROWS, interp="lerpslerp")
+            with built.publisher("f0", BASE) as publisher:
+                start = perf_counter()
+                for turn in range(repeats):
+                    publisher.push_many(START + turn * ROWS + steps, wxyz)
+                return (perf_counter() - start) / ROWS / repeats
+
+        peer = theirs
+    label = f"{'publish' if into == 'bus' else 'insert'}_columns, {shape}"
+    table.measure(label, on, "transform-tree", peer, "", "ns")
 
 
 @pytest.mark.parametrize(("name", "span"), [("a sweep of 0.1 s", SWEEP), ("10 s of history", 998 * PERIOD)])

@@ -6,7 +6,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from statistics import median
+from typing import Any
 
 import anyio
 import pytest
@@ -21,6 +23,7 @@ pytest_plugins = ["side_by_side"]
 
 BACKENDS = pytest.mark.parametrize("backend", ["asyncio", "asyncio+uvloop", "trio"])
 SECONDS = 4.0
+PATHS = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
 SETTLE, RESTED = 10.0, 20.0
 STATICS = [f"fixed {number}" for number in range(50)]
 
@@ -63,11 +66,32 @@ async def main(options, times):
 anyio.run(main, *json.loads(sys.argv[1]))
 """
 
+# Links of the same options, each with a bus of its own.
+MANY = """
+import json, sys
+from contextlib import AsyncExitStack
+import anyio
+from tfbus import Bus
+from support.peer_process import link_of
+
+async def main(options, count):
+    async with AsyncExitStack() as stack:
+        for _ in range(count):
+            await stack.enter_async_context(link_of(stack.enter_context(Bus()), options))
+        await anyio.to_thread.run_sync(sys.stdin.read)
+
+anyio.run(main, *json.loads(sys.argv[1]))
+"""
+
 
 @pytest.fixture
 def processes() -> Iterator[Crowd]:
     with crowd() as together:
         yield together
+
+
+def program(text: str, *arguments: Any) -> list[str]:
+    return [sys.executable, "-c", text, json.dumps(arguments)]
 
 
 def pair(processes: Crowd, place: Place, backend: str) -> tuple[PeerProcess, PeerProcess]:
@@ -130,9 +154,9 @@ def test_rate(backend: str, size: int, wanted: str, table: Table, place: Place, 
 
 def test_process(table: Table, place: Place, processes: Crowd) -> None:
     processes.add(place.first()).ask("statics", names=STATICS)
-    command = [sys.executable, "-c", PROCESS, json.dumps([place.other(), 500])]
-    paths = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=200, env=paths)
+    done = subprocess.run(
+        program(PROCESS, place.other(), 500), capture_output=True, text=True, check=True, timeout=200, env=PATHS
+    )
     before, linked, threads, met, left = json.loads(done.stdout)
     memory = f"{linked:.1f} MB", f"{before:.1f} without; {threads} threads"
     table.add(f"{place.carrier}: a process with a link", *memory, "", "<= 45 MB, <= 3 threads")
@@ -141,15 +165,13 @@ def test_process(table: Table, place: Place, processes: Crowd) -> None:
 
 
 @pytest.mark.parametrize("peers", [0, 50])
-def test_peers(table: Table, place: Place, processes: Crowd, peers: int) -> None:
+def test_peers(table: Table, place: Place, peers: int) -> None:
     """The cost of knowing peers that do nothing, and of each message to them. They do not hear each other."""
-    other = place.other(robot="other", robots=["one"])
+    others = program(MANY, place.other(robot="other", robots=["one"]), peers // 2)
 
     async def main() -> list[float]:
         with Bus() as bus:
             async with link_of(bus, place.first(robot="one")) as link:
-                for _ in range(2 if peers else 0):
-                    processes.begin(*[other] * (peers // 2))
                 await until(lambda: len(link.peers) == peers)
                 await anyio.sleep(SETTLE)
                 times = [time.process_time()]
@@ -161,7 +183,12 @@ def test_peers(table: Table, place: Place, processes: Crowd, peers: int) -> None
                 assert len(link.peers) == peers
                 return [*times, time.process_time()]
 
-    start, rested, end = anyio.run(main)
+    with ExitStack() as stack:
+        for _ in range(2 if peers else 0):
+            process = stack.enter_context(subprocess.Popen(others, stdin=subprocess.PIPE, env=PATHS))
+            assert process.stdin is not None
+            stack.callback(process.stdin.close)
+        start, rested, end = anyio.run(main)
     message = f"{(end - rested) * 1e3:.0f} us a message"
     table.add(
         f"{place.carrier}: {peers} peers", f"{(rested - start) / RESTED:.2%} at rest", message, "", "0.2 %, 500 us"

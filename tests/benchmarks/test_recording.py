@@ -1,6 +1,7 @@
 """Messages of ROS, to and from bytes, beside rosbags; the speed at which a recording is read; the cost of commands."""
 
 import json
+import math
 import os
 import subprocess
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import anyio
 import cases
 import numpy as np
 import pytest
@@ -17,8 +19,8 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 from support.processes import TFBUS
 
-from tfbus import Transform, TransformStamped
-from tfbus.recording import load
+from tfbus import Buffer, Bus, SimulatedClock, SystemClock, Transform, TransformStamped
+from tfbus.recording import Player, convert, load
 from tfbus.tf_message import decode, encode
 
 pytest_plugins = ["side_by_side"]
@@ -73,6 +75,7 @@ START = 1_700_000_000_000_000_000
 ROUNDS = 3
 LOADED = 200_000
 MILLION = 1_000_000
+PLAYED = 100_000
 
 Write = Callable[[int, int], Path]
 
@@ -116,6 +119,29 @@ def test_load(table: Table, write: Write, at_once: int) -> None:
         rates.append(LOADED / (perf_counter() - start))
         assert tree.inserted == LOADED
     table.add(f"load, {at_once} in a message", f"{sorted(rates)[ROUNDS // 2]:,.0f}/s", wanted=">= 50,000/s")
+
+
+@pytest.mark.parametrize(("clock", "wanted"), [(SystemClock, ">= 300,000/s"), (SimulatedClock, ">= 150,000/s")])
+def test_play(table: Table, write: Write, clock: type[SystemClock | SimulatedClock], wanted: str) -> None:
+    path = write(PLAYED, 1)
+    rates = []
+    for _ in range(ROUNDS):
+        with Bus(clock()) as bus, Buffer(bus) as buffer:
+            start = perf_counter()
+            anyio.run(Player(bus, path, rate=math.inf).play)
+            rates.append(PLAYED / (perf_counter() - start))
+            assert buffer.tree.inserted == PLAYED
+    table.add(f"play, 1 in a message, {clock.__name__}", f"{max(rates):,.0f}/s", wanted=wanted)
+
+
+def test_convert(table: Table, write: Write, tmp_path: Path) -> None:
+    path = write(PLAYED, 1)
+    rates = []
+    for number in range(ROUNDS):
+        start = perf_counter()
+        assert convert([path], tmp_path / f"copy {number}.mcap").transforms == PLAYED
+        rates.append(PLAYED / (perf_counter() - start))
+    table.add("convert, 1 in a message", f"{max(rates):,.0f}/s", wanted=">= 260,000/s")
 
 
 @pytest.mark.parametrize(

@@ -8,19 +8,22 @@ import tracemalloc
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from functools import partial
+from itertools import count, pairwise
 from statistics import median
-from time import perf_counter
+from time import perf_counter, thread_time
 from typing import Any
 
 import anyio
 import anyio.lowlevel
 import cases
+import numpy as np
 import pytest
-from beside import ROUNDS, Ask, Table, Turn, build, last_of, name_of, show, take_turns
+from beside import ROUNDS, Ask, Table, Turn, build, last_of, name_of, show, take_turns, timed
 from cases import AUTHORITY, BASE, START, Case, Pass, Vector
 
 import tfbus
 from tfbus import Buffer, Bus, Transform, TransformStamped
+from tfbus.tree.history import FrameHistory
 
 pytest_plugins = ["side_by_side"]
 
@@ -119,6 +122,70 @@ def test_beside_tf2(table: Table, tf2: Ask | None, label: str, case: Case, wante
         return lambda: one_pass()[0]
 
     table.measure(label, on, "tf2", None if tf2 is None else lambda: tf2(case)[0], wanted)
+
+
+@pytest.mark.parametrize("depth", [1, 3, 10])
+def test_a_prefix(table: Table, depth: int) -> None:
+    """The same question to a buffer with a prefix and to one without."""
+    bus = Bus(max_behind=None)
+    plain, local = Buffer(bus, 2 * cases.KEEP), Buffer(bus, 2 * cases.KEEP, prefix="r/")
+    frames = [f"f{i}" for i in range(depth + 1)]
+    for parent, child in pairwise(frames):
+        bus.publish([sample.replace(parent=f"r/{parent}", child=f"r/{child}") for sample in moving("a", HUNDRED)])
+    stamps = [START + i * cases.PERIOD + 1 for i in range(HUNDRED - 1)]
+
+    def asking(buffer: Buffer, prefix: str) -> Turn:
+        ask, target, source = buffer.lookup_nowait, prefix + frames[0], prefix + frames[-1]
+        return timed(lambda: [ask(target, source, stamp) for stamp in stamps], len(stamps))
+
+    ours, theirs = take_turns(asking(local, ""), asking(plain, "r/"))
+    table.compare(f"lookup with a prefix, depth {depth}", ours, "without", theirs, "<= 1.3", "ns")
+
+
+ROBOTS, PARTS = 64, 20
+
+
+def test_a_buffer_with_a_prefix_for_each_robot(table: Table) -> None:
+    """Each buffer has a history of each robot, so both figures grow with the number of robots."""
+    poses = np.tile(Transform().rotation, (PARTS, 1))
+
+    def fleet(buffers: int) -> tuple[Turn, Callable[[], int]]:
+        bus = Bus(max_behind=None)
+        kept = [Buffer(bus, prefix=f"r{robot}/") for robot in range(buffers)]
+        names = [[f"r{robot}/p{part}" for part in range(PARTS)] for robot in range(ROBOTS)]
+        ticks = count(START, cases.PERIOD)
+
+        def one_turn() -> float:
+            stamp = next(ticks)
+            start = perf_counter()
+            for robot in names:
+                bus.publish_columns(BASE, robot, stamp, np.zeros((PARTS, 3)), poses, AUTHORITY)
+            return (perf_counter() - start) / ROBOTS / PARTS
+
+        return one_turn, lambda: sum(buffer.tree.inserted for buffer in kept)
+
+    (one, _), (each, inserted) = fleet(1), fleet(ROBOTS)
+    ours, theirs = take_turns(each, one, rounds=FEW_ROUNDS)
+    assert inserted() == FEW_ROUNDS * ROBOTS * PARTS * ROBOTS
+    table.compare(f"publish to {ROBOTS} buffers with prefixes", ours, "to one", theirs, "<= 0.6 us")
+
+
+A_LONG_HISTORY = 1_000_000
+
+
+@pytest.mark.parametrize("keep", [None, A_LONG_HISTORY])
+def test_the_longest_pause_of_an_append(table: Table, keep: int | None) -> None:
+    """In the time of the processor, because another program may have it for longer. `keep` in ns."""
+    edge = FrameHistory("f0", BASE, static=False, keep=keep)
+    row = (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
+    edge.insert(BASE, 0, row, "")
+    longest = 0.0
+    for stamp in range(1, 2 * A_LONG_HISTORY):
+        start = thread_time()
+        edge.append(BASE, stamp, row, "")
+        longest = max(longest, thread_time() - start)
+    kind = "keep=None" if keep is None else "a window of a million"
+    table.add(f"longest append, {kind}", f"{longest * 1e3:.2f} ms", wanted="<= 3 ms")
 
 
 def hundred_frames(package: Any, *, built: bool) -> Turn:

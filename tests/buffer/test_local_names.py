@@ -2,7 +2,9 @@
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
+from itertools import product
 from typing import Any
 
 import anyio
@@ -10,7 +12,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from support.asking import Asked, driving, settle
-from support.samples import static, x_of
+from support.samples import any_samples, static, x_of
 from support.strategies import frame_names
 
 from tfbus import (
@@ -27,6 +29,7 @@ from tfbus import (
     SimulatedClock,
     Transform,
     TransformBroadcaster,
+    TransformLookupError,
     UnknownFrameError,
 )
 from tfbus.frames import Prefix, check_frame, is_frame
@@ -290,3 +293,41 @@ def test_a_frame_without_a_local_name_gets_a_leading_slash(text: str, shared: se
     prefix = Prefix(text, shared)
     local = prefix.local(name)
     assert local == f"/{name}" if local.startswith("/") else prefix.on_bus(local) == name
+
+
+@given(st.lists(st.lists(any_samples("abc", 20), max_size=4) | st.sampled_from(["a", "jump"]), max_size=8))
+def test_a_buffer_with_a_prefix_answers_as_one_without_whatever_was_asked_before(steps: list[Any]) -> None:
+    clock = SimulatedClock(100)
+    with (
+        Bus(clock, max_ahead=None) as bus,
+        Buffer(bus, 10e-9) as plain,
+        Buffer(bus, 10e-9, prefix="r/", shared={"a"}) as local,
+    ):
+        robot = TransformBroadcaster(bus, prefix="r/", shared={"a"}, invalid="drop")
+        for step in steps:
+            if step == "jump":
+                clock.set(clock.now() - 1)
+            elif step == "a":
+                with suppress(UnknownFrameError):
+                    bus.remove_frame("a")
+            else:
+                robot.send_all(step)
+            # Twice, because the second answer may come from what the first one has found.
+            for at in (LATEST, 7, 7, LATEST):
+                for target, source in product("abc", repeat=2):
+                    above, below = (name if name == "a" else "r/" + name for name in (target, source))
+                    found, expected = (
+                        answer_or_error(local, target, source, at),
+                        answer_or_error(plain, above, below, at),
+                    )
+                    assert found == expected
+
+
+def answer_or_error(buffer: Buffer, target: str, source: str, at: Any) -> Any:
+    """All of an answer but its names, or the text of its error."""
+    try:
+        answer = buffer.lookup_nowait(target, source, at)
+    except TransformLookupError as error:
+        return str(error)
+    assert (answer.parent, answer.child) == (target, source)
+    return answer.stamp, answer.transform, answer.static

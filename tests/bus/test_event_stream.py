@@ -24,7 +24,6 @@ from tfbus.bus.event_stream import EventQueue
 
 pytestmark = pytest.mark.anyio
 
-Events = list[Event]
 ENDS: list[Callable[[Bus, EventStream], None]] = [lambda bus, _: bus.close(), lambda _, events: events.close()]
 
 

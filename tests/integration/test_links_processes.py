@@ -24,8 +24,6 @@ BLOCKED = 3.0
 """The seconds for which a slow process does not return to its event loop."""
 RATE = 500 / 3
 """Batches of 20 that each of three processes sends a second: 10,000 samples a second in all."""
-SOON = 3.0
-"""s; so long after the end of a trouble everything is told."""
 
 
 @pytest.fixture

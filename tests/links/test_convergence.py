@@ -49,7 +49,7 @@ def trouble(
             case 0:
                 process.publish(draw.choice(NAMES), static=True)
             case 1:
-                process.publish(f"moving of {process.name}", static=False)
+                process.publish(draw.choice([f"moving of {process.name}", "moving of all"]), static=False)
             case 2:
                 process.remove(draw.choice([*process.frames, *NAMES]))
             case 3 if len(world.processes) < 6:
@@ -240,6 +240,28 @@ def test_what_was_said_once_while_a_peer_was_away_arrives_soon_after(
         assert agree(world.processes)
         assert {"goal", "camera"} <= away.frames.keys()
         assert "gone" not in away.frames
+
+
+@pytest.mark.parametrize("drop_lost", [False, True])
+def test_of_what_two_parted_buses_have_said_of_one_frame_the_later_holds_for_all(drop_lost: bool) -> None:
+    world = World()
+    network = Network(world)
+    # The one that speaks first was started last and has more to say, so it would have the higher numbers if buses only
+    # counted from their start.
+    other, one = (world.process(network, drop_lost=drop_lost) for _ in range(2))
+    network.cut(one.wire)
+    for stamp in range(200):
+        one.say(moving("map", "base", stamp))
+    one.say(moving("map", "goal", 1), static("map", "camera", 1.0))
+    world.run(7.0)
+    other.say(moving("map", "goal", 2), static("map", "camera", 2.0))
+    network.heal()
+    world.run(5.0)
+    late = world.process(network, drop_lost=drop_lost)
+    world.run(5.0)
+    for process in (one, other, late):
+        assert process.frames["goal"].stamp == 2
+        assert process.frames["camera"].transform.translation[0] == 2.0
 
 
 @pytest.mark.parametrize("seconds", [0.01, 60.0])

@@ -15,8 +15,8 @@ from support.memory_wire import MemoryNetwork, MemoryWire
 from support.processes import until
 from support.samples import moving, static
 
-from tfbus import Bus, BusClosedError, SimulatedClock
-from tfbus.links import DomainLink
+from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, TransformStamped
+from tfbus.links import BufferServer, DomainLink
 from tfbus.links.message import MAX_SAMPLES, Kind, Outgoing, kind_of, write_message
 from tfbus.links.relay import OutgoingBatch
 from tfbus.links.seams import Hearing, Receive
@@ -205,6 +205,52 @@ async def test_a_bus_that_closes_while_the_wire_opens_is_not_linked_and_one_that
             await until(lambda: bool(link.peers))
             await settle()
             assert link.statistics().rejected == {}
+
+
+async def test_a_bus_that_links_again_hears_and_says_nothing_twice() -> None:
+    network = MemoryNetwork()
+    with Bus() as bus, Bus() as other:
+        heard: list[TransformStamped] = []
+        said: list[TransformStamped] = []
+        async with DomainLink(other, "tf", network.wire()) as peer:
+            async with DomainLink(bus, "tf", network.wire()) as link:
+                other.publish([static("map", "camera"), static("map", "lidar"), moving("map", "base", 1)])
+                bus.publish(static("map", "own"))
+                await until(lambda: (bus.statistics().frames, other.statistics().frames) == (4, 4))
+            await until(lambda: not peer.peers)
+            bus.remove_frame("lidar")
+            bus.publish(static("map", "meanwhile"))
+            for samples, each in ((heard, bus), (said, other)):
+                each.subscribe(samples.extend)
+                samples.clear()
+            async with DomainLink(bus, "tf", network.wire()) as link:
+                await until(lambda: len(heard) == 1 and len(said) == 1)
+                other.publish(moving("map", "base", 2))
+                await until(lambda: len(heard) == 2)
+                assert link.peers == (peer.id,)
+        # The frame that was removed without a link comes back, for others still have it.
+        assert heard == [static("map", "lidar"), moving("map", "base", 2)]
+        assert said == [static("map", "meanwhile"), moving("map", "base", 2)]
+
+
+@pytest.mark.every_loop
+async def test_a_link_that_is_used_in_another_event_loop_says_so(anyio_backend_name: str) -> None:
+    async def use(link: DomainLink) -> None:
+        for use in (
+            lambda: link.lookup("map", "base"),
+            link.__aenter__,
+            lambda: link.__aexit__(None, None, None),
+            BufferServer(buffer, link).__aenter__,
+        ):
+            with pytest.raises(RuntimeError, match="'tf': 0 peers> was entered in another event loop"):
+                await use()
+
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with DomainLink(bus, "tf", MemoryNetwork().wire()) as link:
+            await anyio.to_thread.run_sync(lambda: anyio.run(use, link, backend=anyio_backend_name))
+            with pytest.raises(RuntimeError, match="entered once"):
+                await link.__aenter__()
+        assert repr(link) == "<DomainLink 'tf': not joined>"
 
 
 def test_after_a_crash_of_the_event_loop_what_comes_does_no_harm_and_what_is_published_says_so(

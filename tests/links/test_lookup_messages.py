@@ -17,7 +17,6 @@ from tfbus import (
 )
 from tfbus.links.message import (
     MAX_LOOKUP,
-    Cancellation,
     RemoteQuestion,
     read_answer,
     read_question,
@@ -31,18 +30,17 @@ SHORT = FutureExtrapolationError(child="base", stamp=9, oldest=1, newest=5, auth
 @pytest.mark.parametrize(
     "message",
     [
-        RemoteQuestion("me", 1, "map", "base", LATEST),
-        RemoteQuestion("me", 2, "map", "base", 7, 0.5, 1.0, LATEST, "odom", math.inf, 0.2, 0.1),
-        Cancellation("me", 2),
+        RemoteQuestion("map", "base", LATEST),
+        RemoteQuestion("map", "base", 7, 0.5, 1.0, LATEST, "odom", math.inf, 0.2, 0.1),
     ],
 )
-def test_a_question_and_its_cancellation_are_read_as_they_were_written(message: RemoteQuestion | Cancellation) -> None:
+def test_a_question_is_read_as_it_was_written(message: RemoteQuestion) -> None:
     assert read_question(write_question(message)) == message
 
 
 def test_so_large_a_message_is_read_and_no_larger_one() -> None:
-    largest = write_question(Cancellation("me", 2)).ljust(MAX_LOOKUP)
-    assert read_question(largest) == Cancellation("me", 2)
+    largest = write_question(QUESTION).ljust(MAX_LOOKUP)
+    assert read_question(largest) == QUESTION
     with pytest.raises(ValueError, match=f"{MAX_LOOKUP + 1} bytes, more than {MAX_LOOKUP}"):
         read_question(largest + b" ")
 
@@ -54,13 +52,13 @@ def test_so_large_a_message_is_read_and_no_larger_one() -> None:
         b"\xff",
         b"[]",
         b"{}",
-        b'{"type": "Cancellation", "asker": "me"}',
-        b'{"type": "Cancellation", "asker": "me", "number": "1"}',
+        b'{"type": "RemoteQuestion", "target": "map"}',
+        b'{"type": "RemoteQuestion", "target": "map", "source": 1, "at": 1}',
         b"[" * 30_000,
         b'{"type": %b, "message": "m", "cause": null}' % (b"[" * 300 + b"]" * 300),
         b'{"type": "ValueError", "message": ["m"]}',
         b'{"type": {}, "message": "m"}',
-        write_question(Cancellation("m" * MAX_LOOKUP, 1)),
+        write_question(RemoteQuestion("m" * MAX_LOOKUP, "base", 1)),
     ],
 )
 def test_other_bytes_are_no_question_and_no_answer(data: bytes) -> None:
@@ -71,7 +69,7 @@ def test_other_bytes_are_no_question_and_no_answer(data: bytes) -> None:
     assert (error.domain, error.robot, error.reason) == ("tf", "r1", "malformed")
 
 
-QUESTION = RemoteQuestion("me", 2, "map", "base", 7, 0.5, 1.0, LATEST, "odom", 0.3, 0.2, 0.1)
+QUESTION = RemoteQuestion("map", "base", 7, 0.5, 1.0, LATEST, "odom", 0.3, 0.2, 0.1)
 FOUND = TransformStamped("map", "base", 7, Transform((0.1, 0.2, 1 / 3)))
 LATE = LookupTimeoutError(target="map", source="base", timeout=0.5, missing=SHORT)
 LATE.__cause__ = SHORT
@@ -81,7 +79,7 @@ def fields_of(data: bytes, **changes: Any) -> bytes:
     return json.dumps(json.loads(data) | changes).encode()
 
 
-@pytest.mark.parametrize("name", ["number", "at", "timeout", "max_age", "source_at", "tolerance", "max_gap", "hold"])
+@pytest.mark.parametrize("name", ["at", "timeout", "max_age", "source_at", "tolerance", "max_gap", "hold"])
 @pytest.mark.parametrize("digits", [20, 401, 5_000])
 def test_a_question_with_an_integer_of_more_than_64_bits_is_refused(name: str, digits: int) -> None:
     data = fields_of(write_question(QUESTION), **{name: None}).replace(b"null", b"9" * digits)
@@ -89,7 +87,7 @@ def test_a_question_with_an_integer_of_more_than_64_bits_is_refused(name: str, d
         read_question(data)
 
 
-@pytest.mark.parametrize("name", ["asker", "target", "source", "fixed"])
+@pytest.mark.parametrize("name", ["target", "source", "fixed"])
 def test_a_question_with_a_longer_name_than_a_message_of_samples_may_have_is_refused(name: str) -> None:
     read_question(fields_of(write_question(QUESTION), **{name: "x" * 1_024}))
     with pytest.raises(ValueError, match="more than 1024 bytes"):
@@ -146,7 +144,7 @@ PLAIN: st.SearchStrategy[Any] = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
     max_leaves=8,
 )
-MESSAGES = [write_question(QUESTION), write_question(Cancellation("me", 2))]
+MESSAGES = [write_question(QUESTION)]
 MESSAGES += [write_answer(answer) for answer in (FOUND, SHORT, LATE, ValueError("too long"))]
 
 

@@ -31,7 +31,6 @@ from tfbus import (
 )
 from tfbus.links import BufferServer, DomainLink
 from tfbus.links.message import (
-    Cancellation,
     Kind,
     Outgoing,
     RemoteQuestion,
@@ -328,7 +327,7 @@ class Stranger:
 
 
 FOUND = TransformStamped("map", "base", 7, Transform((0.1, 0.2, 1 / 3)))
-QUESTION = RemoteQuestion("me", 1, "map", "base", LATEST)
+QUESTION = RemoteQuestion("map", "base", LATEST)
 
 
 @pytest.mark.parametrize(
@@ -368,7 +367,7 @@ async def test_what_is_no_question_is_refused_and_counted_and_harms_nobody() -> 
         stranger = Stranger(scene.network, "r3")
         await stranger.open()
         fields = QUESTION.to_dict()
-        bad = [b"garbage", b"{}", b"[" * 60_000, b"x" * 100_000, b'{"type": "Cancellation"}']
+        bad = [b"garbage", b"{}", b"[" * 60_000, b"x" * 100_000, b'{"type": "RemoteQuestion"}']
         hostile: list[dict[str, Any]] = [{name: int("9" * 401)} for name in ("timeout", "max_age", "hold", "at")]
         hostile += [{"max_gap": 2**64}, {"max_gap": [[[[[]]]]]}, {"target": "m" * 2_000}, {"type": [0] * 1_000}]
         bad += [json.dumps(fields | change).encode() for change in hostile]
@@ -394,10 +393,10 @@ async def test_a_number_under_which_a_lookup_waits_is_refused_for_another_and_ca
         for _ in range(2):
             one.say(scene.link.id, Kind.LOOKUP, number + write_question(QUESTION))
         await until(lambda: len(one.bodies) == 1)
-        other.say(scene.link.id, Kind.LOOKUP, number + write_question(Cancellation("me", 5)))
+        other.say(scene.link.id, Kind.LOOKUP, number)
         await settle()
         assert scene.counts == {"waiting": 1, "refused": {"malformed": 1}}
-        one.say(scene.link.id, Kind.LOOKUP, number + write_question(Cancellation("me", 5)))
+        one.say(scene.link.id, Kind.LOOKUP, number)
         await until(lambda: scene.server.statistics().waiting == 0)
         scene.bus.publish(static("map", "base"))
         await settle()

@@ -27,7 +27,6 @@ from tfbus.links.endpoint import MAX_PEERS, MOST_AUTHORITY_TEXT
 from tfbus.links.history import MOST_HELD_SAMPLES, HistoryAsker
 from tfbus.links.local import LocalLink
 from tfbus.links.message import (
-    Cancellation,
     Entry,
     Heard,
     Kind,
@@ -81,13 +80,13 @@ def valid(scene: Scene) -> list[bytes]:
     number = scene.number
     entries = OutgoingBatch(BUS, number, (moving("map", "arm", 1), static("map", "leg"))), RemovedFrame(BUS, 1, "leg")
     reach = [(OTHER, (BUS, OTHER))]
-    question = RemoteQuestion("s", 1, "map", "arm", LATEST, 1.0, 2.0, 3, "map", 0.1, 0.2, 0.3)
+    question = RemoteQuestion("map", "arm", LATEST, 1.0, 2.0, 3, "map", 0.1, 0.2, 0.3)
     return [
         *(live(*entries, kind=kind, number=1, time=5, reach=reach) for kind in Kind if kind.value in (1, 2, 3, 5, 7)),
         write_text(Kind.QUESTION, {"since": 0, "frames": ["arm"]}),
         write_text(Kind.PAST_QUESTION, {"seconds": 1.0, "after": ""}),
         lookup(1, write_question(question)),
-        lookup(1, write_question(Cancellation("s", 1)), Kind.LOOKUP_ANSWER),
+        lookup(1, write_question(question), Kind.LOOKUP_ANSWER),
     ]
 
 
@@ -213,9 +212,9 @@ def false_times(_: Scene) -> Iterator[bytes]:
 
 def lookups(_: Scene) -> Iterator[bytes]:
     for number in range(1_500):
-        question = RemoteQuestion("s", number, "map", f"unknown {number}", LATEST, 10.0)
+        question = RemoteQuestion("map", f"unknown {number}", LATEST, 10.0)
         yield lookup(number, write_question(question))
-        yield lookup(number, write_question(Cancellation("s", number - 3)))
+        yield lookup(number - 3, b"")
         yield lookup(number, json.dumps({"type": "TransformStamped"}).encode(), Kind.LOOKUP_ANSWER)
     yield lookup(1, b'{"timeout": ' + b"9" * 401 + b"}")
 

@@ -160,6 +160,8 @@ class Network:
 class Wire:
     """See `tfbus.links.seams.Wire`; the end of the link that uses it calls it without an event loop."""
 
+    rest = 2.0
+
     def __init__(self, network: Network, robot: str = "") -> None:
         self.network = network
         self.robot = robot

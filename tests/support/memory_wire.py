@@ -59,6 +59,7 @@ class MemoryWire:
     """See `tfbus.links.seams.Wire`."""
 
     receive: Receive
+    rest = 2.0
 
     def __init__(self, network: MemoryNetwork, robot: str) -> None:
         self.id = os.urandom(16).hex()

@@ -2,11 +2,12 @@
 
 import sys
 from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import anyio
-from support.processes import Program, until
+from anyio.abc import SocketStream
+from support.processes import Program, free_address, until
 
 from tfbus.links.seams import Hearing, Joined, Left, WireItem
 from tfbus.links.zenoh.wire import ZenohWire
@@ -89,6 +90,57 @@ async def until_heard(ear: Ear, other: Ear) -> None:
         return (other.id, b"published") in news and (other.id, b"sent") in news
 
     await until(heard)
+
+
+class Way:
+    """Passes on what goes between a router that connects to an address, and the router behind it."""
+
+    def __init__(self, to: str) -> None:
+        self.address = free_address()
+        self.open: list[tuple[SocketStream, SocketStream]] = []
+        self._to = to
+
+    async def run(self) -> None:
+        (_, port), (_, behind) = (address.removeprefix("tcp/").split(":") for address in (self.address, self._to))
+
+        async def take(near: SocketStream) -> None:
+            with suppress(OSError):
+                async with near, await anyio.connect_tcp("127.0.0.1", int(behind)) as far:
+                    ends = near, far
+                    self.open.append(ends)
+                    async with anyio.create_task_group() as tasks:
+                        tasks.start_soon(pass_on, ends, near, far)
+                        tasks.start_soon(pass_on, ends, far, near)
+
+        async def pass_on(ends: tuple[SocketStream, SocketStream], one: SocketStream, other: SocketStream) -> None:
+            with suppress(anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError):
+                async for data in one:
+                    await other.send(data)
+            if ends in self.open:
+                self.open.remove(ends)
+                await other.aclose()
+
+        listener = await anyio.create_tcp_listener(local_host="127.0.0.1", local_port=int(port))
+        async with listener:
+            await listener.serve(take)
+
+    async def cut(self, *, far_only: bool = False) -> None:
+        """End all connections, or let only the router behind the address notice."""
+        ended, self.open = self.open, []
+        for near, far in ended:
+            await far.aclose()
+            if not far_only:
+                await near.aclose()
+
+
+@asynccontextmanager
+async def way_to(address: str) -> AsyncIterator[Way]:
+    """A way on which a program is to connect to an address."""
+    way = Way(address)
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(way.run)
+        yield way
+        tasks.cancel_scope.cancel()
 
 
 _ROUTER = """

@@ -40,6 +40,7 @@ class LoopWaker:
         self._callback = callback
         self._call_soon: Callable[[Callable[[], object]], object] | None = None
         self._call_soon_here: Callable[[Callable[[], object]], object] | None = None
+        self._loop: Any = None
         self._thread = 0
         self._loop_is_closed: Callable[[], bool] = _never
         self._context: Context
@@ -53,7 +54,7 @@ class LoopWaker:
     def bind(self) -> None:
         """Wake the running event loop from now on."""
         # anyio has no public function for this; only the loops' own functions wake them from a thread.
-        native = cast(Any, anyio.lowlevel.current_token().native_token)
+        self._loop = native = cast(Any, anyio.lowlevel.current_token().native_token)
         self._call_soon = getattr(native, "run_sync_soon", None) or native.call_soon_threadsafe
         # On the loop's own thread, asyncio needs no byte through its socket pair to wake up.
         self._call_soon_here = getattr(native, "call_soon", self._call_soon)
@@ -63,6 +64,11 @@ class LoopWaker:
         self._context = copy_context()
         # An earlier loop may have ended without answering a request.
         self._requested = False
+
+    @property
+    def is_here(self) -> bool:
+        """Whether the running event loop is the one that is woken; it raises if none runs."""
+        return anyio.lowlevel.current_token().native_token is self._loop
 
     def wake(self) -> None:
         """Request a call of the callback; for any thread.

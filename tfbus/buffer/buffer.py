@@ -105,8 +105,7 @@ class Buffer:
                 raise TypeError(f"prefill must be a Buffer or a TransformTree, not {prefill!r}")
             bus._check_thread()
             self._forest = forest_of(tree).copy_within(window)
-        # None with a prefix: then the paths have other names.
-        self._paths = self._forest.paths if named is None else None
+        self._paths = self._forest.paths if named is None else self._forest.local_paths
         self._tree = tree_of(self._forest, keep, bus.max_translation)
         self._live = LiveTree(self._forest, bus._announce_past_loop)
         self._lookups = Lookups(self._live, bus, self._local_names)
@@ -165,7 +164,10 @@ class Buffer:
             if names is None:
                 return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
             via = None if fixed is None else names.on_bus(fixed)
-            found = answer(self._forest, names.on_bus(target), names.on_bus(source), at, source_at, via, bounds, policy)
+            above, below = names.on_bus(target), names.on_bus(source)
+            found = answer(self._forest, above, below, at, source_at, via, bounds, policy)
+            # The next such lookup is as plain as one without a prefix.
+            self._forest.keep_locally((target, source), above, below)
         except ExtrapolationError as error:
             self._lookups.note_ahead(error)
             raise

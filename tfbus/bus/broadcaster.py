@@ -3,13 +3,16 @@
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 
+import numpy.typing as npt
+
 from tfbus.bus.bus import Bus
 from tfbus.bus.topology import Invalid, as_invalid
 from tfbus.errors import BusClosedError, UnknownFrameError
 from tfbus.frames import as_prefix
+from tfbus.geometry.columns import Names
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
-from tfbus.stamps import StampLike
+from tfbus.stamps import StampLike, StampsLike
 
 
 class TransformBroadcaster:
@@ -105,6 +108,41 @@ class TransformBroadcaster:
         """
         stamp = self._stamp(at)
         self.bus.publish([self._sample(sample, stamp) for sample in samples], self._invalid)
+
+    def send_columns(
+        self,
+        parents: Names,
+        children: Names,
+        translations: npt.ArrayLike,
+        rotations: npt.ArrayLike,
+        at: StampLike | StampsLike | None = None,
+    ) -> None:
+        """Publish the samples in some arrays as one batch; see `Bus.publish_columns`.
+
+        Parameters
+        ----------
+        parents, children : str, or sequence of n str
+            One name for all rows, or a name for each.
+        translations : array of shape (n, 3)
+            In m.
+        rotations : array of shape (n, 4)
+            Unit quaternions (x, y, z, w).
+        at : int, or integer array of shape (n,), optional
+            ns; one stamp for all rows, or one for each. By default the clock's now, the same for all.
+
+        Raises
+        ------
+        InvalidTransformError, BusClosedError, TypeError, ValueError
+            As `Bus.publish_columns`.
+        """
+        above, below = (
+            (self._on_bus(names) if isinstance(names, str) else [*map(self._on_bus, names)])
+            if self._prefix is not None
+            else names
+            for names in (parents, children)
+        )
+        stamps = self.bus.clock.now() if at is None else at
+        self.bus.publish_columns(above, below, stamps, translations, rotations, self.authority, invalid=self._invalid)
 
     def send_static(self, parent: str, child: str, transform: Transform) -> None:
         """Publish a transform that holds at every stamp. Later subscribers get it too; sending it again replaces it.

@@ -17,6 +17,7 @@ from typing import Any
 from weakref import WeakSet
 
 import anyio
+import numpy.typing as npt
 
 from tfbus._aio.loops import LoopWaker
 from tfbus.bus.event_stream import EventStream
@@ -28,9 +29,10 @@ from tfbus.bus.topology import Invalid, Plausibility, Topology, as_invalid, as_m
 from tfbus.clock import Clock, SimulatedClock, SystemClock
 from tfbus.errors import BusClosedError, UnknownFrameError, loop_text
 from tfbus.events import ClockReset, Event, PastLoop
+from tfbus.geometry.columns import Names, SampleColumns
 from tfbus.geometry.stamped import MAX_TRANSLATION, Batch, TransformStamped, as_batch, check_translations
 from tfbus.registration import Registration
-from tfbus.stamps import format_stamp
+from tfbus.stamps import StampLike, StampsLike, format_stamp
 from tfbus.statistics import BusStatistics
 from tfbus.tree.forest import LoopingSample
 from tfbus.waiting.live_tree import LiveTree
@@ -299,6 +301,62 @@ class Bus:
             self._subscribers.deliver(batch)
         if error is not None:
             raise error
+
+    def publish_columns(
+        self,
+        parents: Names,
+        children: Names,
+        stamps: StampLike | StampsLike,
+        translations: npt.ArrayLike,
+        rotations: npt.ArrayLike,
+        authority: str = "",
+        *,
+        static: bool = False,
+        invalid: Invalid = "raise",
+    ) -> None:
+        """Send the samples in some arrays as one batch, as `publish` does with objects, but ten times as fast.
+
+        Parameters
+        ----------
+        parents, children : str, or sequence of n str
+            One name for all rows, such as one frame's at many stamps, or a name for each row.
+        stamps : int, or integer array of shape (n,)
+            ns. One stamp for all rows, such as many frames' at once, or a stamp for each row.
+        translations : array of shape (n, 3)
+            In m; each maps the origin of the child into its parent.
+        rotations : array of shape (n, 4)
+            Unit quaternions (x, y, z, w). A norm within 1 % of one is normalised; the sign stays as given.
+        authority : str
+            The sender of all rows.
+        static : bool
+            Whether the rows hold at every stamp.
+        invalid : {"raise", "drop"}
+            As `publish`; a row that cannot be a sample is refused like one that the bus refuses.
+
+        Raises
+        ------
+        InvalidTransformError
+            If a row cannot be a sample, which the message then names by its index, or as `publish`. Nothing is stored.
+        TypeError, ValueError
+            If a column has not one value for all rows or for each, or something in it has another type.
+        BusClosedError, RuntimeError
+            As `publish`.
+
+        Examples
+        --------
+        >>> with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        ...     moves = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+        ...     bus.publish_columns("map", ["left", "right"], 100, moves, [[0.0, 0.0, 0.0, 1.0]] * 2, "tracker")
+        ...     buffer.lookup_nowait("left", "right", 100).transform.translation
+        (1.0, 0.0, 0.0)
+        """
+        if get_ident() != self._owner.thread or self._closed:
+            self._check_usable()
+        refuse = self._topology.drop if invalid == "drop" else None
+        bound = self._plausibility.max_translation
+        columns = SampleColumns(parents, children, stamps, translations, rotations, authority, static, bound)
+        if columns.plain is None or not self._take(columns.plain, invalid):
+            self.publish(columns.samples(refuse), invalid)
 
     def _check_thread(self) -> None:
         """Raise `RuntimeError` unless this thread may use the bus. Called by buffers, message filters and links.

@@ -377,6 +377,13 @@ class Topology:
         # A copy, because the traceback of the original keeps the sender's variables alive.
         self._announcer.announce(SampleRejected(self._announcer.now(), reason, child, parent, authority, copy(error)))
 
+    def drop(self, error: InvalidTransformError) -> None:
+        """Count, announce and log a sample that was left out."""
+        self.reject(error.reason, error)
+        # Strangers may try any number of names.
+        cause = () if isinstance(error, TooManyFramesError) else (error.child, error.authority)
+        self._log.warning((error.reason, *cause), "dropped a sample: %s", error)
+
     @contextmanager
     def recorded_time(self) -> Iterator[None]:
         """A ``with`` for samples whose stamps are of another clock; none of them is ahead or behind."""
@@ -430,14 +437,12 @@ class Topology:
         if rejects_ahead:
             for sample in ahead:
                 self._tell_ahead(sample.child, sample.stamp, sample.authority)
-        for error in refused:
-            self.reject(error.reason, error)
         if refused and invalid == "raise":
+            for error in refused:
+                self.reject(error.reason, error)
             raise refused[0]
         for error in refused:
-            # Strangers may try any number of names.
-            cause = () if isinstance(error, TooManyFramesError) else (error.child, error.authority)
-            self._log.warning((error.reason, *cause), "dropped a sample: %s", error)
+            self.drop(error)
         for sample in accepted:
             self._record(sample)
         if behind or (ahead and not rejects_ahead):

@@ -7,9 +7,7 @@ or None for success. For a fault that a user can cause, it raises `UsageError`, 
 """
 
 import os
-import shutil
 import sys
-import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from io import TextIOWrapper
@@ -109,6 +107,9 @@ def run(words: Sequence[str], loaded: Callable[[], object] = lambda: None) -> in
 
 def _overview() -> str:
     """The help of all commands, laid out as cyclopts does it."""
+    import shutil
+    import textwrap
+
     width = shutil.get_terminal_size((80, 24)).columns
     commands = COMMANDS | {
         "--help (-h)": "Display this message and exit.",
@@ -133,6 +134,8 @@ def _overview() -> str:
 
 def _panel(title: str, rows: Mapping[str, str], width: int) -> str:
     """A box; each row has a name and its meaning."""
+    import textwrap
+
     names = max(map(len, rows))
     room = max(width - names - 6, 8)
     lines = [
@@ -202,11 +205,10 @@ def _shown_default(default: object) -> str | None:
 
 
 def _version() -> str:
-    from importlib.metadata import version
-
+    from tfbus import __version__
     from tfbus.which_kernel import kernel
 
-    return f"{version('tfbus')} ({kernel} kernel)"
+    return f"{__version__} ({kernel} kernel)"
 
 
 _PAGES: Final = dict.fromkeys([(), ("-h",), ("--help",)], _overview) | {("--version",): _version}

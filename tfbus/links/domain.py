@@ -42,7 +42,6 @@ from tfbus.tf_message import MalformedMessageError
 
 SIGN_PERIOD = 1.0
 SIGN_PERIOD_EACH = 0.05
-LONGEST_SIGN_PERIOD = 2.0
 LONGEST_SIGN_PERIOD_EACH = 0.1
 """s; a link signs so long after it has sent something or met a peer, and then after twice that time, up to the longest.
 
@@ -119,8 +118,8 @@ class DomainEnd(Endpoint):
         self._replicas: dict[str, Replica] = {}
         self.own = self._replica_of(robot)
         self._agreement = Agreement()
-        self._history = None if history is None else HistoryAsker(history, self._ask_past, now)
-        self.lookups = RemoteLookups(wire.send, wire.id, name)
+        self._history = HistoryAsker(history or 0.0, self._ask_past, now)
+        self.lookups = RemoteLookups(wire.send, name)
         self._news: dict[str, bool] = {}
         # The last sign of each peer of which nothing is wanted: the same sign once more need not wake the event loop.
         self._resting: dict[str, bytes] = {}
@@ -157,20 +156,17 @@ class DomainEnd(Endpoint):
             self.handle(sender, _Due(kind, self._questions.pop((sender, kind))))
             after = self._now()
             now, self._answers_due = after, 2 * after - now
-        if self._history is not None:
-            for peer in self._history.overdue():
-                self._end_history(peer)
+        for peer in self._history.overdue():
+            self._end_history(peer)
         due = self._agreement.next_due()
         if now >= due:
             self._ask(now)
             due = self._agreement.next_due()
         if now >= self._sign_due:
             peers = len(self.present)
-            self._sign_period = min(2 * self._sign_period, max(LONGEST_SIGN_PERIOD, LONGEST_SIGN_PERIOD_EACH * peers))
+            self._sign_period = min(2 * self._sign_period, max(self._wire.rest, LONGEST_SIGN_PERIOD_EACH * peers))
             self._sign(now)
-        due = min(due, self._sign_due, self._answers_due if self._questions else inf)
-        if self._history is not None:
-            due = min(due, self._history.next_due())
+        due = min(due, self._sign_due, self._history.next_due(), self._answers_due if self._questions else inf)
         if self._wire.is_heard(SLOW):
             if now >= self._slow_due:
                 self._slow_due = now + self._slow_period
@@ -319,8 +315,7 @@ class DomainEnd(Endpoint):
                 if peer.rate:
                     # A peer hears of a filter by the first question.
                     self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
-                    if self._history is not None:
-                        self._history.joined(sender)
+                    self._history.joined(sender)
                 self.host.stir()
             elif sender not in self.peers and len(self._waiting) < MOST_WAITING:
                 self._waiting[sender] = content
@@ -368,7 +363,7 @@ class DomainEnd(Endpoint):
                     return
             if heard.kind is not Kind.SIGN:
                 self.messages += 1
-        if heard.kind is Kind.LIVE and self._history is not None and self._history.holds(sender, heard):
+        if heard.kind is Kind.LIVE and self._history.holds(sender, heard):
             return
         self._take_held(peer, heard)
 
@@ -477,7 +472,7 @@ class DomainEnd(Endpoint):
         live: bool,
         past: bool = False,
     ) -> None:
-        if not live and not past and self._history is not None and self._history.open:
+        if not live and not past and self._history.open:
             # The newest sample of a moving frame would make its past no news.
             batches = [(source, [sample for sample in samples if sample.static]) for source, samples in batches]
         if self.drop_lost:
@@ -634,7 +629,7 @@ class DomainEnd(Endpoint):
         self._wire.send(peer, write_text(Kind.PAST_QUESTION, {"seconds": seconds, "after": after}))
 
     def _take_past(self, peer: Peer, heard: Heard) -> None:
-        if self._history is None or peer.id not in self._history.open:
+        if peer.id not in self._history.open:
             return
         goes_on = heard.goes_on
         try:
@@ -653,7 +648,7 @@ class DomainEnd(Endpoint):
     def _end_history(self, peer: str, lost: Peer | None = None) -> None:
         """Publish what waited for the past of a peer, with it or without it; the peer may be lost."""
         known = lost or self.peers.get(peer)
-        if self._history is not None and peer in self._history.open:
+        if peer in self._history.open:
             held = self._history.end(peer)
             if known is not None:
                 # The newest samples that were told meanwhile, if no past has come.

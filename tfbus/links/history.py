@@ -109,6 +109,7 @@ class HistoryAsker:
     Parameters
     ----------
     seconds : float
+        0 to ask nobody.
     ask : callable
         Asks a peer for so many seconds of the frames after a name.
     now : callable
@@ -130,7 +131,7 @@ class HistoryAsker:
 
     def joined(self, peer: str) -> None:
         """Ask a peer, if it was not asked before."""
-        if peer not in self._asked:
+        if self._seconds and peer not in self._asked:
             self._asked[peer] = None
             if len(self._asked) > MOST_REMEMBERED:
                 del self._asked[next(iter(self._asked))]

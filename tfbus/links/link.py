@@ -287,6 +287,8 @@ class Link:
 
     async def __aenter__(self) -> Self:
         if self._entered:
+            if self._attached:
+                self._check_loop()
             raise RuntimeError("a link is entered once: make another one")
         self.bus._check_thread()
         if self.bus.closed:
@@ -320,6 +322,7 @@ class Link:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         assert self._tasks is not None
+        self._check_loop()
         for registration in self._registrations:
             registration.close()
         self._attached = False
@@ -331,6 +334,10 @@ class Link:
         finally:
             self.bus._entered.discard(self)
             await self._end.close()
+
+    def _check_loop(self) -> None:
+        if not self._received.is_here:
+            raise RuntimeError(f"{self!r} was entered in another event loop: make a bus and a link for each event loop")
 
     # For the end: the event loop
 
@@ -541,10 +548,11 @@ class DomainLink(Link):
 
     @property
     def lookups(self) -> RemoteLookups:
-        """The lookups of the link; raises `RuntimeError` unless it is entered, and here. For a `BufferServer`."""
-        self.bus._check_thread()
+        """For a `BufferServer`: the lookups of the link; raises `RuntimeError` unless it is entered in this loop."""
         if not self._attached:
+            self.bus._check_thread()
             raise RuntimeError("the link is not entered")
+        self._check_loop()
         return self._domain_end.lookups
 
     def serve(self, server: BufferServer | None) -> None:
@@ -589,13 +597,11 @@ class DomainLink(Link):
         TransformLookupError, BusClosedError, ClockResetError, TypeError, ValueError
             As `tfbus.Buffer.lookup` there: the same error, with its facts.
         RuntimeError
-            If 10,000 lookups wait already, or the link is not entered.
+            If 10,000 lookups wait already, or the link is not entered in this event loop.
         """
         policy_of(tolerance, max_gap, extrapolate)
         limit = math.inf if timeout is None else as_duration(timeout, "timeout")
         question = RemoteQuestion(
-            asker=self.id,
-            number=0,
             target=target,
             source=source,
             at=at if isinstance(at, Latest) else as_stamp(at),

@@ -9,6 +9,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from time import monotonic
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -23,7 +24,6 @@ from tfbus.bus.subscribers import OnceLogger
 from tfbus.errors import MAY_COME, LookupTimeoutError, RemoteLookupError, TransformError, TransformLookupError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.message import (
-    Cancellation,
     Kind,
     RemoteQuestion,
     as_timeout,
@@ -66,8 +66,6 @@ class RemoteLookups:
     ----------
     send : callable
         Sends a message to a link; returns False if it is known not to arrive.
-    id : str
-        The name of this link.
     domain : str
     capacity : int
         How many questions may wait for their answers at once.
@@ -78,9 +76,8 @@ class RemoteLookups:
         The buffer that this link serves.
     """
 
-    def __init__(self, send: Callable[[str, bytes], bool], id: str, domain: str, capacity: int = 10_000) -> None:  # noqa: A002
+    def __init__(self, send: Callable[[str, bytes], bool], domain: str, capacity: int = 10_000) -> None:
         self._send = send
-        self._id = id
         self._domain = domain
         self._capacity = capacity
         # Drawn at random, so that nobody guesses the numbers of questions of others.
@@ -127,12 +124,14 @@ class RemoteLookups:
             self.server.lose(peer)
 
     def asked(self, asker: str, data: bytes) -> None:
-        """Take a question of a link."""
-        number = int.from_bytes(data[:_NUMBER], "little")
+        """Take a question of a link, or its cancellation: its number, and the question or nothing."""
+        number, question = int.from_bytes(data[:_NUMBER], "little"), data[_NUMBER:]
         if self.server is None:
             self.refuse(asker, number, "absent", "nobody offers it")
-        elif len(data) > _NUMBER:
-            self.server.take(asker, number, data[_NUMBER:])
+        elif question:
+            self.server.take(asker, number, question)
+        else:
+            self.server.cancel(asker, number)
 
     def answered(self, peer: str, data: bytes) -> None:
         """Take an answer of a link: its number, and what it says.
@@ -203,7 +202,7 @@ class RemoteLookups:
         pending = self._pending[number] = _Pending(server)
         answered = False
         try:
-            if not self._put(server, number, write_question(question, number, timeout)):
+            if not self._put(server, number, write_question(replace(question, timeout=timeout))):
                 raise self._error(robot, "silent", "the question could not be sent")
             with anyio.move_on_after(timeout + PATIENCE):
                 await pending.done.wait()
@@ -211,7 +210,7 @@ class RemoteLookups:
         finally:
             del self._pending[number]
             if not answered:
-                self._put(server, number, write_question(Cancellation(self._id, number)))
+                self._put(server, number, b"")
         if not answered:
             raise self._error(robot, "silent", f"it has not answered within {timeout + PATIENCE:g} s")
         if pending.answer is None:
@@ -325,9 +324,7 @@ class BufferServer:
         except ValueError as error:
             self._refuse(*key, "malformed", f"the question cannot be read: {error}")
             return
-        if isinstance(question, Cancellation):
-            self._cancel(key)
-        elif not self._admit():
+        if not self._admit():
             self._refuse(*key, "busy", f"more than {self._rate:g} lookups come in a second")
         elif key in self._waiting:
             self._refuse(*key, "malformed", "the number of the question was used before")
@@ -337,7 +334,14 @@ class BufferServer:
     def lose(self, asker: str) -> None:
         """Cancel the questions of a link that has gone. Called by the link."""
         for key in [key for key in self._waiting if key[0] == asker]:
-            self._cancel(key)
+            self.cancel(*key)
+
+    def cancel(self, asker: str, number: int) -> None:
+        """Cancel a question, if it waits. Called by the link."""
+        scope = self._waiting.pop((asker, number), None)
+        if scope is not None:
+            self._counts["cancelled"] += 1
+            scope.cancel()
 
     def _take(self, key: tuple[str, int], question: RemoteQuestion) -> None:
         try:
@@ -394,12 +398,6 @@ class BufferServer:
             return False
         self._allowance -= 1
         return True
-
-    def _cancel(self, key: tuple[str, int]) -> None:
-        scope = self._waiting.pop(key, None)
-        if scope is not None:
-            self._counts["cancelled"] += 1
-            scope.cancel()
 
     def _refuse(self, asker: str, number: int, reason: str, detail: str) -> None:
         self._counts[reason] += 1

@@ -15,13 +15,14 @@ sender holds. The samples themselves are a TFMessage behind that. Little endian:
     samples      a TFMessage with the samples of all batches, in their order
 
 The kinds are those of `tfbus.links.replica`, and those of the past and of lookups. Questions are JSON behind version
-and kind; those of lookups, and the answers, have a number of 8 bytes before the JSON. Reading a message costs time in
-proportion to its bytes; handling an entry may cost more, so both have a limit.
+and kind. A question of a lookup and its answer have a number of 8 bytes before the JSON, by which an answer finds its
+question; a number alone cancels the question. Reading a message costs time in proportion to its bytes; handling an
+entry may cost more, so both have a limit.
 
-A question of a lookup, its answer, and its cancellation are JSON too; an error travels with its facts, see
-`tfbus.errors.TransformError.to_dict`. The two functions that read them are the door for the data of strangers. They
-check what Python would trip over later: integers that are no stamps, values inside values, names of any length, errors
-that no lookup raises, and answers to another question. Nothing but a `ValueError` leaves them.
+An error of a lookup travels with its facts, see `tfbus.errors.TransformError.to_dict`. `read_question` and
+`read_answer` are the door for the data of strangers. They check what Python would trip over later: integers that are
+no stamps, values inside values, names of any length, errors that no lookup raises, and answers to another question.
+They raise nothing but a `ValueError`.
 """
 
 import enum
@@ -457,20 +458,14 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
 
 @dataclass(frozen=True, slots=True)
 class RemoteQuestion(PlainData):
-    """One lookup of an asker; all but the first two fields are the arguments of `tfbus.Buffer.lookup`.
+    """A lookup for the buffer of another process; the fields are the arguments of `tfbus.Buffer.lookup`.
 
     Attributes
     ----------
-    asker : str
-        The id of the asker.
-    number : int
-        The asker's number of this question.
     hold : float or None
         The `max_age` of a `tfbus.Hold`, in s.
     """
 
-    asker: str
-    number: int
     target: str
     source: str
     at: int | Latest
@@ -483,38 +478,25 @@ class RemoteQuestion(PlainData):
     hold: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Cancellation(PlainData):
-    """The end of a question that the asker does not wait for any more."""
-
-    asker: str
-    number: int
+def write_question(question: RemoteQuestion) -> bytes:
+    """The bytes of a question."""
+    return json.dumps(question.to_dict()).encode()
 
 
-def write_question(
-    question: RemoteQuestion | Cancellation, number: int | None = None, timeout: float | None = None
-) -> bytes:
-    """The bytes of a question or of its cancellation; with another number and timeout, if a number is given."""
-    fields = question.to_dict()
-    if number is not None:
-        fields |= {"number": number, "timeout": timeout}
-    return json.dumps(fields).encode()
-
-
-def read_question(data: bytes) -> RemoteQuestion | Cancellation:
-    """The question or cancellation in some bytes.
+def read_question(data: bytes) -> RemoteQuestion:
+    """The question in some bytes.
 
     Raises
     ------
     ValueError
-        If they are no such message, or it has an integer of more than 64 bits or a name of more than `MAX_NAME` bytes.
+        If they are no question, or it has an integer of more than 64 bits or a name of more than `MAX_NAME` bytes.
     """
     fields = _read(data)
     for name, value in fields.items():
         if isinstance(value, str) and len(value.encode()) > MAX_NAME:
             raise ValueError(f"its field {_shown(name)} has more than {MAX_NAME} bytes")
     try:
-        return (Cancellation if fields.get("type") == "Cancellation" else RemoteQuestion).from_dict(fields)
+        return RemoteQuestion.from_dict(fields)
     except ValueError as error:
         raise ValueError(str(error)[:_SHOWN]) from None
 

@@ -4,11 +4,11 @@ Every batch is numbered by the bus on which it was published first, its *origin*
 ways, for a bus with two links passes on by each what came by the other. So a sample is news only if its number is
 higher than that of the newest sample of the same origin and child; then no ring of buses has an echo.
 
-A bus numbers on from the highest number that it has seen of any origin (Lamport, "Time, clocks, and the ordering of
-events in a distributed system", 1978). So of two things that are said of one frame, such as a static sample and a
-removal, the one of the higher number was said with the other in mind, or without knowing it; that one holds on every
-bus, in whatever order they come. The first number is the machine's time in microseconds, so that what a program says
-when it is started again holds against what it has said before, although it knows nothing of that.
+The number of a batch is the machine's time in microseconds, or one more than the highest number that the bus has seen
+of any origin, whichever is higher (a hybrid logical clock: Kulkarni, Demirbas, Madappa, Avva and Leone, "Logical
+physical clocks", 2014). So of two statements on one frame, such as a static sample and a removal, the later one has the
+higher number and holds on every bus, in whatever order they arrive: also if the two buses were parted, as far as the
+clocks of their machines agree, and if a program was started again.
 
 Batches of a world that has no origins, such as ROS, get this bus as their origin. Such a world gives back what it was
 sent, by another link of this bus or by another bus, and nothing in it tells. So while a link to such a world is
@@ -291,14 +291,13 @@ class ReceivedBatch:
 class Relay:
     """Passes samples and removals between one bus and its links.
 
-    There is one relay a bus, from `relay_of`. While no link is attached, it does nothing and remembers nothing but its
-    origin and its numbers: by those the bus knows its own samples when its links have ended and others begin.
+    There is one relay a bus, from `relay_of`. It begins with the first link, and goes on after the last one: a later
+    link publishes nothing that an earlier one has published, and sends the frames of the bus with the numbers that they
+    have. Only removals are forgotten, because the later link may be to another domain.
 
     Parameters
     ----------
     bus : Bus
-    number : int
-        The number before the first one.
 
     Attributes
     ----------
@@ -306,12 +305,11 @@ class Relay:
         The name of this bus for others: 16 random bytes.
     """
 
-    _registration: Registration
-
-    def __init__(self, bus: Bus, number: int) -> None:
+    def __init__(self, bus: Bus) -> None:
         self.origin = os.urandom(16)
-        self._number = number
+        self._number = 0
         self._bus = bus
+        self._registration: Registration | None = None
         self._outboxes: list[Outbox] = []
         # The newest number that each origin has given a frame; how many frames each origin has, and all together.
         self._newest: dict[str, dict[bytes, int]] = {}
@@ -342,7 +340,7 @@ class Relay:
         if (foreign or self._outboxes) and self._passed is None:
             # A bus with two links may hear a sample that has gone through a world without origins by either.
             self._passed = PassedSamples()
-        if not self._outboxes:
+        if self._registration is None:
             self._registration = self._bus.subscribe(self._on_batch, self._on_removal)
         for other in self._outboxes:
             for entry in other.kept():
@@ -353,11 +351,12 @@ class Relay:
     def detach(self, outbox: Outbox) -> None:
         """Give a link nothing any more."""
         self._outboxes.remove(outbox)
+        for latest in self._latest.values():
+            if latest.outbox is outbox:
+                # Otherwise the frame would keep the link in memory.
+                latest.outbox = latest.peer = None
         if not self._outboxes:
-            self._registration.close()
-            self._frames = 0
-            for held in (self._newest, self._held, self._latest, self._settled, self._removed, self._lost):
-                held.clear()
+            self._removed.clear()
             self._passed = None
 
     def clock_jumped_back(self) -> None:
@@ -631,7 +630,7 @@ class Relay:
         if self._removing is not None and self._removing[0] == frame:
             provenance = self._removing[1]
         else:
-            provenance = Provenance(self.origin, self._next_number())
+            provenance = Provenance(self.origin, self._next_number()) if self._outboxes else None
         latest = self._latest.pop(frame, None)
         self._forget_frame(frame, provenance)
         if provenance is not None:
@@ -692,7 +691,7 @@ class Relay:
         return static and latest is not None and rank < latest.rank
 
     def _next_number(self) -> int:
-        self._number += 1
+        self._number = max(self._number + 1, time_ns() // 1_000)
         return self._number
 
     def _outnumber(self, number: int, frames: Iterable[str]) -> None:
@@ -706,7 +705,7 @@ class Relay:
 def relay_of(bus: Bus) -> Relay:
     """The relay of a bus, which its links share; the bus itself holds it."""
     if not isinstance(bus._relay, Relay):
-        bus._relay = Relay(bus, time_ns() // 1_000)
+        bus._relay = Relay(bus)
     return bus._relay
 
 

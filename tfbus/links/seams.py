@@ -84,9 +84,13 @@ class Wire(Protocol):
     ----------
     id : str
         The name of this link for all others: 32 hexadecimal digits, drawn at random.
+    rest : float
+        In s, at least so often a link that has nothing to say repeats what it holds. A network that may lose the last
+        message before a silence without a word needs this soon.
     """
 
     id: str
+    rest: float = 2.0
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
         """Join the network, or begin to: where others are not there yet, `run` meets them later.

@@ -16,11 +16,12 @@ import anyio.streams.memory
 import anyio.to_thread
 
 from tfbus._aio.task_groups import close_task_group
+from tfbus._aio.turn_budget import TurnBudget
 from tfbus.bus.bus import Bus
 from tfbus.clock import SimulatedClock
 from tfbus.errors import UnknownFrameError
 from tfbus.recording.recording import RecordedMessage, Recording, Selection, Topics, open_recording
-from tfbus.stamps import as_stamp, from_seconds, is_real, to_seconds
+from tfbus.stamps import SECOND, as_stamp, from_seconds, is_real, to_seconds
 
 _BLOCK = 256
 
@@ -101,6 +102,8 @@ _BLOCKS_AHEAD = 2
 _STEP = 0.02
 _MIN_STEP = 1e-9
 _MAX_STEP = 1e9
+_STRETCH = SECOND
+"""In ns of the log: far less than buffers usually keep."""
 
 
 class Player:
@@ -335,7 +338,8 @@ class Player:
     async def _play_once(self, blocks: ReadAhead, since: int | None) -> None:
         started = False
         async for block in blocks:
-            for message in block:
+            messages = iter(block)
+            for message in messages:
                 if not started:
                     started = True
                     self._begin(message.received if since is None else since)
@@ -343,11 +347,33 @@ class Player:
                 await self._wait_for(message.received)
                 if self._seek_target is not None:
                     return
-                self._publish(message)
+                with self.bus._recorded_time():
+                    self._publish(message)
+                    if self._hurries:
+                        self._publish_at_once(messages, message.received + _STRETCH)
                 if self._paused:
                     # A step was taken.
                     self._steps = max(0, self._steps - 1)
-                    self._origin = message.received
+                    self._origin = self._playhead
+
+    @property
+    def _hurries(self) -> bool:
+        """Whether nothing separates two messages but the turns of other tasks."""
+        return self._rate == math.inf and self._simulated is None and not self._paused and self._seek_target is None
+
+    def _publish_at_once(self, messages: Iterator[RecordedMessage], until: int) -> None:
+        """Publish messages up to a log time (ns), for one turn of the event loop or as long as nothing stops it.
+
+        A checkpoint takes longer than a message. Without the limit, samples that other tasks wait for could leave the
+        windows of buffers before these tasks have their turn.
+        """
+        budget = TurnBudget()
+        while not budget.spent and self._hurries and self._playhead is not None and self._playhead < until:
+            message = next(messages, None)
+            if message is None:
+                return
+            self._playhead = message.received
+            self._publish(message)
 
     def _begin(self, stamp: int) -> None:
         self._origin = self._playhead = stamp
@@ -404,8 +430,7 @@ class Player:
         self.bad.update(error.reason for error in message.errors)
         if not message.batch:
             return
-        with self.bus._recorded_time():
-            self.bus.publish(message.batch, invalid="drop")
+        self.bus.publish(message.batch, invalid="drop")
         self.played += len(message.batch)
         if self._simulated is None:
             for sample in message.batch:

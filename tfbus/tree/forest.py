@@ -472,8 +472,8 @@ class LoopingSample(NamedTuple):
 class Forest:
     """The histories of all frames that have a parent.
 
-    `insert`, `commit`, `remove`, `clear`, `search`, `known_frames`, `some_frames`, `read_all`, `copy` and `copy_within`
-    take the lock themselves. The caller of every other method holds it.
+    `insert`, `commit`, `remove`, `clear`, `search`, `keep_locally`, `known_frames`, `some_frames`, `read_all`, `copy`
+    and `copy_within` take the lock themselves. The caller of every other method holds it.
 
     Parameters
     ----------
@@ -490,6 +490,8 @@ class Forest:
     names : KnownFrames
     paths : PathCache
         The newest paths that have been found and are permanent. A change that could make one wrong empties it.
+    local_paths : PathCache
+        Some of the `paths` under other names, which `keep_locally` has given them; it is emptied with them.
     changing_paths : dict of (target, source) to Path
         The newest paths that have been found and are not permanent.
     changed : set of str
@@ -517,6 +519,7 @@ class Forest:
         self.frames: dict[str, FrameHistory] = {}
         self.names = KnownFrames()
         self.paths = PathCache(self.lock)
+        self.local_paths = PathCache(self.lock)
         self.changing_paths: dict[tuple[str, str], Path] = {}
         self.changed: set[str] = set()
         self.new_parents: set[str] = set()
@@ -697,9 +700,10 @@ class Forest:
         self.expired_samples.clear()
 
     def forget_paths(self) -> None:
-        """Empty `paths` and `changing_paths`."""
+        """Empty `paths`, `local_paths` and `changing_paths`."""
         self.structure += 1
         self.paths.clear()
+        self.local_paths.clear()
         self.changing_paths.clear()
 
     # Questions
@@ -760,6 +764,15 @@ class Forest:
             if len(self.changing_paths) >= _CHANGING_PATHS_KEPT:
                 self.changing_paths.clear()
             self.changing_paths[target, source] = path
+
+    def keep_locally(self, local: tuple[str, str], target: str, source: str) -> None:
+        """Keep a path that was found under local names of its two ends as well. Takes the lock."""
+        if self.local_paths.holds(*local):
+            return
+        with self.lock:
+            path = self.paths.find(target, source)
+            if path is not None:
+                self.local_paths.keep(*local, path)
 
     def known_frames(self) -> tuple[str, ...]:
         """Every frame that a sample names, sorted. Takes the lock."""

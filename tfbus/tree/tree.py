@@ -9,9 +9,11 @@ from functools import partial
 from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from tfbus.data import PointCloud, TwistStamped
 from tfbus.errors import TransformLookupError
+from tfbus.geometry.columns import Names, SampleColumns
 from tfbus.geometry.stamped import (
     MAX_TRANSLATION,
     TransformStamped,
@@ -122,6 +124,63 @@ class TransformTree:
         batch = as_batch(samples)
         check_translations(batch, self.max_translation)
         return self._forest.insert(batch)
+
+    def insert_columns(
+        self,
+        parents: Names,
+        children: Names,
+        stamps: StampLike | StampsLike,
+        translations: npt.ArrayLike,
+        rotations: npt.ArrayLike,
+        authority: str = "",
+        *,
+        static: bool = False,
+    ) -> list[Outcome]:
+        """Store the samples in some arrays, all of them or nothing, as `insert_many` does with objects.
+
+        Parameters
+        ----------
+        parents, children : str, or sequence of n str
+            One name for all rows, such as one frame's at many stamps, or a name for each row.
+        stamps : int, or integer array of shape (n,)
+            ns. One stamp for all rows, such as many frames' at once, or a stamp for each row.
+        translations : array of shape (n, 3)
+            In m; each maps the origin of the child into its parent.
+        rotations : array of shape (n, 4)
+            Unit quaternions (x, y, z, w). A norm within 1 % of one is normalised; the sign stays as given.
+        authority : str
+            The sender of all rows.
+        static : bool
+            Whether the rows hold at every stamp.
+
+        Returns
+        -------
+        list of Outcome
+            One for each row.
+
+        Raises
+        ------
+        InvalidTransformError
+            If a row cannot be a sample, which the message then names by its index, or as `insert_many`.
+        TypeError, ValueError
+            If a column has not one value for all rows or for each, or something in it has another type.
+
+        Examples
+        --------
+        >>> tree = TransformTree(keep=None)
+        >>> outcomes = tree.insert_columns("map", "base_link", [0, 100], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]],
+        ...                                [[0.0, 0.0, 0.0, 1.0]] * 2)
+        >>> tree.lookup("map", "base_link", 50).transform.translation
+        (0.5, 0.0, 0.0)
+        """
+        self._check_writable("use bus.publish_columns, or a copy() of the tree")
+        columns = SampleColumns(
+            parents, children, stamps, translations, rotations, authority, static, self.max_translation
+        )
+        forest = self._forest
+        if columns.plain is not None and forest.paths.commit(forest.frames, forest.readers, columns.plain):
+            return [Outcome.INSERTED] * len(columns)
+        return forest.insert(columns.samples())
 
     @property
     def inserted(self) -> int:

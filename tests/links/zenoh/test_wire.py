@@ -10,6 +10,7 @@ from itertools import product
 from typing import Any
 
 import anyio
+import anyio.lowlevel
 import pytest
 import zenoh
 from hypothesis import given
@@ -209,6 +210,25 @@ async def test_all_links_leave_with_the_router_and_join_again_by_its_successor(
             await met(one, two)
             await talk(one, two)
         assert two.of(one)[:3] == [Joined(""), Left(), Joined("")]
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_a_session_that_breaks_while_its_link_publishes_is_closed(address: str, domain: str) -> None:
+    """A thread that fails would fail the test."""
+    async with listening(domain, connect=address) as one, anyio.create_task_group() as tasks:
+
+        async def publish() -> None:
+            while True:
+                one.wire.publish(LIVE, bytes(2**18))
+                await anyio.lowlevel.checkpoint()
+
+        tasks.start_soon(publish)
+        for _ in range(10):
+            async with ZenohRouter(address), listening(domain, connect=address) as two:
+                await met(one, two)
+            await until(lambda: not one.present)
+        tasks.cancel_scope.cancel()
 
 
 async def test_of_several_addresses_the_first_that_answers_is_taken(address: str, domain: str) -> None:

@@ -1,8 +1,12 @@
+from pathlib import Path
+
 import anyio
 import pytest
 from support.processes import free_address, until
-from support.zenoh_wires import listening, met, talk
+from support.zenoh_wires import LIVE, Ear, Way, listening, met, start_router, talk, way_to
 
+from tfbus.links.seams import Joined, Left
+from tfbus.links.zenoh.sessions import router_config
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
 
 pytestmark = pytest.mark.anyio
@@ -16,6 +20,49 @@ async def test_links_of_routers_that_find_each_other_late_hear_each_other(addres
             await met(one, two)
             await talk(one, two)
         await until(lambda: not one.present)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_routers_that_connect_to_each_other_tell_each_other_all_after_each_break(
+    address: str, domain: str
+) -> None:
+    other = free_address()
+    async with way_to(other) as way, way_to(address) as back:
+        with start_router(address, way.address), start_router(other, back.address):
+            async with listening(domain, connect=address) as one, listening(domain, connect=other) as two:
+                await hear_each_other_after_each_break(one, two, way, back)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_links_that_listen_and_connect_to_each_other_hear_each_other_after_each_break(
+    address: str, domain: str
+) -> None:
+    other = free_address()
+    async with (
+        way_to(other) as way,
+        way_to(address) as back,
+        listening(domain, listen=address, connect=way.address, lease=1.0) as one,
+        listening(domain, listen=other, connect=back.address, lease=1.0) as two,
+    ):
+        await hear_each_other_after_each_break(one, two, way, back)
+
+
+async def hear_each_other_after_each_break(one: Ear, two: Ear, way: Way, back: Way) -> None:
+    for _ in range(3):
+        await met(one, two)
+        await talk(one, two)
+        before = len(one.items), len(two.items)
+        await way.cut(far_only=True)
+        await back.cut()
+        await until(
+            lambda before=before: any(  # type: ignore[misc]
+                Left() in [item for _, item in ear.items[start:]] for ear, start in zip((one, two), before, strict=True)
+            )
+        )
+    await met(one, two)
+    await talk(one, two)
 
 
 async def test_a_router_listens_at_several_addresses(address: str, domain: str) -> None:
@@ -38,6 +85,56 @@ async def test_an_address_in_use_is_an_os_error_and_a_router_is_entered_once(add
             await router.__aenter__()
     async with ZenohRouter(address):
         pass
+
+
+RULES = """{
+  // Robots of the name guest publish nothing.
+  access_control: {
+    enabled: true,
+    default_permission: "allow",
+    rules: [{
+      id: "publishing", messages: ["put"], flows: ["ingress"], permission: "deny", key_exprs: ["tfbus/*/guest/**"],
+    }],
+    subjects: [{id: "all"}],
+    policies: [{rules: ["publishing"], subjects: ["all"]}],
+  },
+}"""
+
+
+async def test_a_router_keeps_to_the_rules_of_a_file(address: str, domain: str, tmp_path: Path) -> None:
+    file = tmp_path / "rules.json5"
+    file.write_text(RULES, encoding="utf-8")
+    async with (
+        ZenohRouter(address, config=file),
+        listening(domain, "guest", connect=address) as guest,
+        listening(domain, "robot", connect=address) as robot,
+        listening(domain, connect=address) as hears,
+    ):
+        await met(guest, robot, hears)
+        guest.wire.publish(LIVE, b"refused")
+        assert guest.wire.send(hears.id, b"a question")
+        await until(lambda: hears.of(guest) == [Joined("guest"), b"a question"])
+        robot.wire.publish(LIVE, b"published")
+        await until(lambda: hears.of(robot) == [Joined("robot"), b"published"])
+        assert hears.of(guest) == [Joined("guest"), b"a question"]
+
+
+def test_a_file_of_settings_wins_over_those_of_the_router_but_for_addresses(tmp_path: Path) -> None:
+    file = tmp_path / "settings.json5"
+    file.write_text("{transport: {link: {tx: {lease: 7000}}}}", encoding="utf-8")
+    config = router_config("tcp/127.0.0.1:0", (), str(file), 2.0)
+    assert config.get_json("transport/link/tx/lease") == "7000"
+    assert config.get_json("scouting/multicast/enabled") == "false"
+    for text, problem in (
+        ('{listen: {endpoints: ["tcp/0.0.0.0:1"]}}', "'listen' is not for config: give addresses by connect and"),
+        ("{no_such_setting: 1}", "zenoh does not take the settings in .*settings.json5: unknown field"),
+        ("garbage", "zenoh does not take the settings in"),
+    ):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(ValueError, match=problem):
+            ZenohRouter(config=file)
+    with pytest.raises(FileNotFoundError):
+        ZenohRouter(config=tmp_path / "none.json5")
 
 
 @pytest.mark.thorough

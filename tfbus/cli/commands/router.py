@@ -1,6 +1,7 @@
 """``tfbus router``."""
 
 import os
+from pathlib import Path
 
 import anyio
 
@@ -14,6 +15,7 @@ def router(
     *,
     listen: tuple[str, ...] = (),
     connect: tuple[str, ...] = (),
+    config: Path | None = None,
     backend: Backend = "asyncio",
 ) -> None:
     """Connect the programs of all domains with each other, until Ctrl-C.
@@ -30,6 +32,8 @@ def router(
         machine reaches.
     connect
         Connect to another router that listens at this address; may be given several times.
+    config
+        A file of zenoh's settings, in JSON5, such as the rules of access_control, which say who may publish.
     backend
         The event loop to run on.
     """
@@ -40,17 +44,21 @@ def router(
         raise UsageError(f"a router needs one more package: {pip_install('cli,zenoh')}") from None
 
     addresses = listen or (ROUTER,)
+    try:
+        zenoh_router = ZenohRouter(addresses, connect=connect, config=config)
+    except OSError as error:
+        raise UsageError(f"cannot read {config}: {error.strerror}") from None
+    except ValueError as error:
+        raise UsageError(str(error)) from None
 
     async def route() -> None:
         try:
-            async with ZenohRouter(addresses, connect=connect):
+            async with zenoh_router:
                 onward = f", and on to {' and '.join(connect)}" if connect else ""
                 say(f"routing at {' and '.join(addresses)}{onward}, until Ctrl-C")
                 await anyio.sleep_forever()
         except OSError as error:
             why = os.strerror(error.errno) if error.errno else error
             raise UsageError(f"cannot listen at {' or '.join(addresses)}: {why}") from None
-        except ValueError as error:
-            raise UsageError(str(error)) from None
 
     run(route, backend)

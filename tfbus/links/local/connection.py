@@ -125,8 +125,10 @@ class Poll:
 
     def ready(self) -> list[tuple[Any, bool, bool]]:
         """The owners of the sockets that are ready, with whether there are bytes to read, and room to write."""
-        found = self._selector.select(0.0) if self._selector.get_map() else []
-        return [(key.data, bool(events & EVENT_READ), bool(events & EVENT_WRITE)) for key, events in found]
+        return [(key.data, bool(events & EVENT_READ), bool(events & EVENT_WRITE)) for key, events in self._select()]
+
+    def _select(self) -> list[tuple[selectors.SelectorKey, int]]:
+        return self._selector.select(0.0) if self._selector.get_map() else []
 
     async def wait(self) -> None:
         """Wait until a socket may be ready."""
@@ -156,7 +158,8 @@ class Poll:
                     tasks.start_soon(watch, lambda sock=key.fileobj: anyio.wait_writable(sock))
 
     def _wake(self) -> None:
-        if self._ready is not None and not self._ready.done():
+        # The loop may have seen the file before the task has read all.
+        if self._ready is not None and not self._ready.done() and self._select():
             self._ready.set_result(None)
 
     def close(self) -> None:

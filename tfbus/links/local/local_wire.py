@@ -96,6 +96,9 @@ class LocalWire(Wire):
         Windows. All links of a domain have to use the same.
     """
 
+    # A connection loses nothing but what waits for too long, and what is said last is kept.
+    rest = 6.0
+
     def __init__(
         self, domain: str, robot: str = "", *, directory: str | None = None, loopback: bool | None = None
     ) -> None:

@@ -13,6 +13,7 @@ import re
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 import zenoh
@@ -38,16 +39,17 @@ _NAME = "tfbus and zenoh end"
 _forked = _used = False
 
 Addresses = str | Iterable[str]
+Settings = Mapping[str, Any] | str | os.PathLike[str]
+"""Settings of zenoh by their path, or the name of a file of zenoh's settings, in JSON5."""
 
 _ON_NETWORK = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[^\]]+\]|[^:/?#\s]+):(?P<port>\d{1,5})([?#].*)?")
 _ON_MACHINE = re.compile(r"(unixsock-stream|unixpipe|serial|vsock)/.+")
 # Each session draws its own id, and the arguments say the rest.
 _NOT_TO_SET = re.compile("id|mode|listen|listen/endpoints.*|connect|connect/endpoints.*")
+_NOT_IN_FILE = "id", "mode", "listen", "connect"
 
 
-def router_config(
-    listen: Addresses, connect: Addresses, config: Mapping[str, Any] | None, lease: float | None
-) -> zenoh.Config:
+def router_config(listen: Addresses, connect: Addresses, config: Settings | None, lease: float | None) -> zenoh.Config:
     """The settings of a router, which keeps trying to reach all other routers in `connect`; raises as `client_config`.
 
     Parameters
@@ -70,16 +72,16 @@ def router_config(
     return _config(values, config, lease)
 
 
-def client_config(connect: Addresses, config: Mapping[str, Any] | None, lease: float | None) -> zenoh.Config:
+def client_config(connect: Addresses, config: Settings | None, lease: float | None) -> zenoh.Config:
     """The settings of a client of any of some routers.
 
     Parameters
     ----------
     connect : str or iterable of str
         zenoh's endpoints, such as ``tcp/192.168.1.5:7447``.
-    config : mapping of str to any, or None
-        zenoh's own settings by their path, such as ``transport/link/tls/root_ca_certificate``; they override all
-        others.
+    config : mapping of str to any, or str or path, or None
+        zenoh's own settings by their path, such as ``transport/link/tls/root_ca_certificate``, or the name of a file
+        of such settings; they override all others.
     lease : float or None
         Seconds of silence after which the other end takes this one for lost; each end announces its own. None is for
         `LEASE`.
@@ -90,19 +92,17 @@ def client_config(connect: Addresses, config: Mapping[str, Any] | None, lease: f
         If an address is malformed, zenoh refuses a setting or its value, or `lease` is not positive and finite.
     TypeError
         If an argument has another type.
+    OSError
+        If the file cannot be read.
     """
     values = {"mode": "client", "connect/endpoints": endpoints(connect), "connect/timeout_ms": 0}
     return _config(values, config, lease)
 
 
-def _config(values: dict[str, Any], config: Mapping[str, Any] | None, lease: float | None) -> zenoh.Config:
+def _config(values: dict[str, Any], config: Settings | None, lease: float | None) -> zenoh.Config:
     silence = LEASE if lease is None else as_duration(lease, "lease")
     if not 0 < silence < math.inf:
         raise ValueError(f"lease must be a time that passes, got {lease}")
-    own = dict(config or {})
-    for path in own:
-        if _NOT_TO_SET.fullmatch(path):
-            raise ValueError(f"zenoh's setting {path!r} is not for config: give addresses by connect and listen")
     values |= {
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
@@ -116,13 +116,35 @@ def _config(values: dict[str, Any], config: Mapping[str, Any] | None, lease: flo
         "transport/link/rx/max_message_size": MAX_MESSAGE + 2**17,
     }
     result = zenoh.Config()
-    for path, value in (values | own).items():
+    if isinstance(config, str | os.PathLike):
+        default, result = result, _read_settings(config)
+        chosen = {path for path in (*values, *_NOT_IN_FILE) if result.get_json(path) != default.get_json(path)}
+        _check_settings(chosen.intersection(_NOT_IN_FILE))
+        values = {path: value for path, value in values.items() if path not in chosen}
+    elif config is not None:
+        _check_settings(config)
+        values |= config
+    for path, value in values.items():
         try:
             result.insert_json5(path, json.dumps(value))
         except (zenoh.ZError, TypeError) as error:
             why = without_source_location(error)
             raise ValueError(f"zenoh does not take {value!r} for its setting {path!r}: {why}") from None
     return result
+
+
+def _read_settings(file: str | os.PathLike[str]) -> zenoh.Config:
+    text = Path(file).read_text(encoding="utf-8")
+    try:
+        return zenoh.Config.from_json5(text)
+    except zenoh.ZError as error:
+        raise ValueError(f"zenoh does not take the settings in {file}: {without_source_location(error)}") from None
+
+
+def _check_settings(paths: Iterable[str]) -> None:
+    for path in paths:
+        if _NOT_TO_SET.fullmatch(path):
+            raise ValueError(f"zenoh's setting {path!r} is not for config: give addresses by connect and listen")
 
 
 def open_client(config: zenoh.Config, address: str) -> zenoh.Session:

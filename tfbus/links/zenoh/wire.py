@@ -9,7 +9,8 @@ Keys, where *robot* is ``~`` for a link without one, *link* is 32 hexadecimal di
     tfbus/domain/robot/@alive/link/n    a liveliness token for each session of a link, declared when it hears all
 
 Connecting: a link dials a router, the first of its addresses that answers within `OPENING_TIME`. Links never dial each
-other. With ``listen`` a link's own session is a router; it dials the other routers, and never breaks.
+other. With ``listen`` a link's own session is a router; it dials the other routers, and breaks only if one of these
+tells it nothing (see `tfbus.links.zenoh.neighbours`).
 
 Present: a link is present while the token of its newest known session is seen. A new session of a present link is told
 as `Left` and `Joined`, because messages may have been lost between them. The token of an older session means nothing
@@ -33,7 +34,7 @@ import os
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from random import uniform
@@ -45,10 +46,12 @@ import zenoh
 
 from tfbus._aio.loops import LoopWaker
 from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
+from tfbus.links.zenoh.neighbours import Neighbours
 from tfbus.links.zenoh.sessions import (
     LONGEST_NAME,
     Addresses,
     Keeper,
+    Settings,
     begin_to_close,
     client_config,
     close_session,
@@ -68,6 +71,8 @@ SETTLED: Final = 1.0
 """s after which a router has told a new publisher who subscribes to it."""
 PAUSE: Final = (0.2, 0.6)
 """s between two attempts to reach any router; drawn at random, because a router that starts again has many clients."""
+PAUSE_TO_LISTEN: Final = 0.05
+"""s between two attempts to listen again."""
 NO_ROBOT: Final = "~"
 
 _NAME = re.compile(r"[\w.-]+", re.ASCII)
@@ -91,8 +96,9 @@ class ZenohWire(Wire):
         when the session with it breaks. With `listen` the router of this process connects to all of them.
     listen : str or iterable of str, optional
         Run a router in this process that listens there.
-    config : mapping of str to any, optional
-        Settings of zenoh by their path: TLS, access control.
+    config : mapping of str to any, or str or path, optional
+        Settings of zenoh by their path: TLS, access control. Or the name of a file of them, as zenoh's own router
+        takes it.
     lease : float, optional
         Seconds of silence after which the other end takes this one for lost; by default `sessions.LEASE`.
 
@@ -111,7 +117,7 @@ class ZenohWire(Wire):
         *,
         connect: Addresses | None = None,
         listen: Addresses | None = None,
-        config: Mapping[str, Any] | None = None,
+        config: Settings | None = None,
         lease: float | None = None,
     ) -> None:
         self.id = os.urandom(16).hex()
@@ -131,6 +137,7 @@ class ZenohWire(Wire):
             )
         self._session: _Session | None = None
         self._number = 0
+        self._has_listened = False
         self._keeper = Keeper(self._keep)
         self._failure: OSError | None = None
 
@@ -197,8 +204,8 @@ class ZenohWire(Wire):
         channels: list[str] = []
         while (session := self._connect(channels)) is not None:
             self._wake()
-            while not (self._keeper.stopped or session.hearer.broken):
-                self._keeper.changed.wait()
+            while not (self._keeper.stopped or session.is_broken(monotonic())):
+                self._keeper.changed.wait(session.period)
                 self._keeper.changed.clear()
             self._session = None
             channels = session.channels
@@ -222,6 +229,11 @@ class ZenohWire(Wire):
                     failure = error
                 self._addresses.rotate(-1)
             if self._is_router:
+                # The session before may not have freed the address yet.
+                if self._has_listened:
+                    self._keeper.changed.wait(PAUSE_TO_LISTEN)
+                    self._keeper.changed.clear()
+                    continue
                 self._failure = failure
             elif since is not None and monotonic() > since + FIRST_WAIT:
                 since = None
@@ -238,6 +250,7 @@ class ZenohWire(Wire):
     def _connect_once(self, channels: Iterable[str]) -> "_Session":
         self._number += 1
         raw = open_session(self._config) if self._is_router else open_client(self._config, self._addresses[0])
+        self._has_listened = self._is_router
         hearer = _Hearer(self.id, self._domain, self._hears, self._receive, self._keeper.changed)
         session = _Session(raw, hearer, self._own, self.id)
         try:
@@ -245,7 +258,7 @@ class ZenohWire(Wire):
                 session.declare(channel)
             # The owner may send something to a link as soon as that has joined.
             self._session = session
-            session.begin(self._domain, self._number, self._hears, breaks=not self._is_router)
+            session.begin(self._domain, self._number, self._hears, is_router=self._is_router)
         except zenoh.ZError as error:
             self._session = None
             hearer.end()
@@ -269,16 +282,30 @@ class _Session:
         self._link = link
         self._sender = bytes.fromhex(link)
         self._publishers: dict[str, tuple[zenoh.Publisher, float]] = {}
+        # zenoh refuses to undeclare a publisher by which the event loop is publishing.
+        self._publishing = threading.Lock()
         self._declared: list[object] = []
+        self._neighbours: Neighbours | None = None
 
     @property
     def channels(self) -> list[str]:
         return list(self._publishers)
 
-    def begin(self, domain: str, number: int, hears: Sequence[Hearing], *, breaks: bool) -> None:
+    def is_broken(self, now: float) -> bool:
+        """Whether another session is needed."""
+        return self.hearer.broken or (self._neighbours is not None and self._neighbours.are_silent(now))
+
+    @property
+    def period(self) -> float | None:
+        """The time in s after which `is_broken` is to be called again; None if not before a change."""
+        return None if self._neighbours is None else self._neighbours.period
+
+    def begin(self, domain: str, number: int, hears: Sequence[Hearing], *, is_router: bool) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
         session, hearer, declared = self._session, self.hearer, self._declared
-        if breaks:
+        if is_router:
+            self._neighbours = Neighbours(session, hearer.changed.set)
+        else:
             declared.append(session.info.declare_transport_events_listener(_directly(hearer.take_event)))
         for index, (robots, channel) in enumerate(hears):
             take = _directly(partial(hearer.take_published, index))
@@ -292,7 +319,7 @@ class _Session:
             key = f"{domain}/{robots_expression(robots)}/@alive/*/*"
             declared.append(liveliness.declare_subscriber(key, take, history=True))
         declared.append(liveliness.declare_token(f"{self._own}/@alive/{self._link}/{number}"))
-        if breaks and not session.info.transports():
+        if not is_router and not session.info.transports():
             # It broke before anybody listened.
             hearer.broken = True
 
@@ -307,14 +334,15 @@ class _Session:
 
     def is_heard(self, channel: str) -> bool:
         try:
-            publisher, since = self._publishers.get(channel) or self.declare(channel)
-            return bool(publisher.matching_status.matching) or monotonic() < since + SETTLED  # type: ignore[attr-defined]
+            with self._publishing:
+                publisher, since = self._publishers.get(channel) or self.declare(channel)
+                return bool(publisher.matching_status.matching) or monotonic() < since + SETTLED  # type: ignore[attr-defined]
         except zenoh.ZError:
             # The session has just ended.
             return False
 
     def publish(self, channel: str, message: bytes) -> None:
-        with suppress(zenoh.ZError):
+        with suppress(zenoh.ZError), self._publishing:
             publisher, _ = self._publishers.get(channel) or self.declare(channel)
             publisher.put(message)
 
@@ -329,12 +357,13 @@ class _Session:
 
     def close(self) -> None:
         """Close the session; blocks."""
-        for publisher, _ in list(self._publishers.values()):
-            # Otherwise zenoh keeps 13 kB of each for ever.
-            with suppress(zenoh.ZError):
-                publisher.undeclare()
+        with self._publishing:
+            for publisher, _ in list(self._publishers.values()):
+                # Otherwise zenoh keeps 13 kB of each for ever.
+                with suppress(zenoh.ZError):
+                    publisher.undeclare()
         try:
-            self._session.close()
+            (self._neighbours or self._session).close()
         finally:
             # The garbage collector does not see through zenoh's objects.
             self._declared.clear()
@@ -352,7 +381,7 @@ class _Hearer:
         self._rest = len(domain) + 1
         self._hears = hears
         self._receive = receive
-        self._changed = changed
+        self.changed = changed
         self._lock = threading.Lock()
         self._ended = False
         # The number of the newest session of each link that is present, and which of `hears` is for it.
@@ -401,7 +430,7 @@ class _Hearer:
     def take_event(self, event: zenoh.TransportEvent) -> None:
         if event.kind == zenoh.SampleKind.DELETE:
             self.broken = True
-            self._changed.set()
+            self.changed.set()
 
     def end(self) -> None:
         """Have all links leave, and take nothing any more; in any thread."""

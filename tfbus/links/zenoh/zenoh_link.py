@@ -1,11 +1,10 @@
 """`ZenohLink`: joins a bus to the buses of other machines by zenoh's routers."""
 
-from collections.abc import Mapping
-from typing import Any, Unpack
+from typing import Unpack
 
 from tfbus.bus.bus import Bus
 from tfbus.links.link import DomainLink, DomainOptions, check_domain
-from tfbus.links.zenoh.sessions import Addresses
+from tfbus.links.zenoh.sessions import Addresses, Settings
 from tfbus.links.zenoh.wire import ZenohWire
 
 
@@ -25,8 +24,9 @@ class ZenohLink(DomainLink):
         when the connection breaks.
     listen : str or iterable of str, optional
         Run a router in this process that listens at these addresses, and connects to those of `connect`.
-    config : mapping of str to any, optional
-        Settings of zenoh by their path, such as ``transport/link/tls/root_ca_certificate``.
+    config : mapping of str to any, or str or path, optional
+        Settings of zenoh by their path, such as ``transport/link/tls/root_ca_certificate``. Or the name of a file of
+        them, as zenoh's own router takes it.
     lease : float, optional
         Seconds of silence after which a router takes this link for lost; 4 s by default. A process that dies is lost at
         once.
@@ -54,7 +54,7 @@ class ZenohLink(DomainLink):
         *,
         connect: Addresses | None = None,
         listen: Addresses | None = None,
-        config: Mapping[str, Any] | None = None,
+        config: Settings | None = None,
         lease: float | None = None,
         **options: Unpack[DomainOptions],
     ) -> None:

@@ -1,25 +1,37 @@
 """A zenoh router in this process, which links and other routers connect to."""
 
 import threading
-from collections.abc import Mapping
+from time import monotonic
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import anyio
 import anyio.to_thread
 
-from tfbus.links.zenoh.sessions import Addresses, Keeper, close_session, open_session, router_config
+from tfbus.links.zenoh.neighbours import Neighbours
+from tfbus.links.zenoh.sessions import (
+    Addresses,
+    Keeper,
+    Settings,
+    begin_to_close,
+    close_session,
+    open_session,
+    router_config,
+)
 from tfbus.registration import warn_unless_entered
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
 """The address of a router that is given none: only processes of this machine reach it."""
+PAUSE: Final = 0.05
+"""s between two attempts to listen again."""
 
 
 class ZenohRouter:
     """Passes on what links send each other: ``async with ZenohRouter("tcp/192.168.1.5:7447")``.
 
     It has no bus, knows no domains, and passes on only what a link behind it, or behind another router, has subscribed
-    to. Routers that are connected are as one; each link needs one of them.
+    to. Routers that are connected are as one; each link needs one of them. A router begins anew, and its links connect
+    again, if another one is connected and tells it nothing (see `tfbus.links.zenoh.neighbours`).
 
     Parameters
     ----------
@@ -27,8 +39,9 @@ class ZenohRouter:
         zenoh's endpoints; by default ``tcp/127.0.0.1:17447``, which only this machine reaches.
     connect : str or iterable of str, optional
         The addresses of other routers.
-    config : mapping of str to any, optional
-        Settings of zenoh by their path: TLS, access control.
+    config : mapping of str to any, or str or path, optional
+        Settings of zenoh by their path: TLS, access control. Or the name of a file of them, as zenoh's own router
+        takes it.
     lease : float, optional
         Seconds of silence after which the router is taken for lost, and so the time in which links notice that they are
         cut off from it; 4 s by default.
@@ -38,7 +51,8 @@ class ZenohRouter:
     ValueError, TypeError
         If zenoh does not take an address or a setting, or an argument has another type.
     OSError
-        On entering, if it cannot listen where it should.
+        If the file of settings cannot be read; on entering, if the router cannot listen where it should, or zenoh
+        finds that its rules do not fit together.
     RuntimeError
         On entering a second time.
     """
@@ -48,7 +62,7 @@ class ZenohRouter:
         listen: Addresses = ROUTER,
         *,
         connect: Addresses | None = None,
-        config: Mapping[str, Any] | None = None,
+        config: Settings | None = None,
         lease: float | None = None,
     ) -> None:
         self._config = router_config(listen, connect or (), config, lease)
@@ -79,13 +93,25 @@ class ZenohRouter:
         await self._keeper.end()
 
     def _keep(self) -> None:
-        try:
-            session = open_session(self._config)
-        except OSError as error:
-            self._failure = error
-            return
-        finally:
-            self._opened.set()
-        while not self._keeper.stopped:
-            self._keeper.changed.wait()
-        close_session(session)
+        """Have one session after another, until the router is closed; the first one has to open."""
+        keeper = self._keeper
+        while not (self._opened.is_set() and keeper.stopped):
+            try:
+                router = Neighbours(open_session(self._config), keeper.changed.set)
+            except OSError as error:
+                if not self._opened.is_set():
+                    self._failure = error
+                    return
+                # The session before may not have freed the address yet.
+                keeper.changed.wait(PAUSE)
+                keeper.changed.clear()
+                continue
+            finally:
+                self._opened.set()
+            while not (keeper.stopped or router.are_silent(monotonic())):
+                keeper.changed.wait(router.period)
+                keeper.changed.clear()
+            if keeper.stopped:
+                close_session(router)
+            else:
+                begin_to_close(router)

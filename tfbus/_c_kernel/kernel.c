@@ -1,0 +1,96 @@
+/* The compiled kernel: samples, the history of an edge, a path, the plain answer and the plain commit.
+ *
+ * The Python twins, which tfbus/_kernel.pyi names, are its definition. Both give the same bits, so every sum below is
+ * added in the order of tfbus/rows.py, and the compiler must not fuse a multiplication with an addition
+ * (-ffp-contract=off). A case that is not plain is handed back to Python by None, False or a count. There is no policy
+ * and no text of a transform error here.
+ *
+ * While a function touches a history, it runs no Python code, allocates no object that the garbage collector tracks,
+ * and keeps the interpreter's lock, so other threads see each call as one step. Only the answers at many stamps are
+ * made without that lock, from blocks that nobody changes while they have a reader.
+ *
+ * This is the one file that is compiled. It includes a file for each story, in the order in which one needs the other,
+ * so everything is static and the compiler sees all of it at once.
+ */
+#include "base.h"
+#include "samples.h"
+#include "paths.h"
+#include "waiting.h"
+#include "publishing.h"
+
+/* The module -------------------------------------------------------------------------------------------------------- */
+
+static PyMethodDef module_methods[] = {
+    {"compose_paths", FAST(compose_paths), METH_FASTCALL,
+     PyDoc_STR("compose_paths(rows, origins): make every pose relative to the first one.")},
+    {"decode", FAST(decode), METH_FASTCALL,
+     PyDoc_STR("decode(body, at, tags, names, kind): the samples of a message up to the first that is not plain, and "
+               "its offset.")},
+    {"columns", FAST(columns), METH_FASTCALL,
+     PyDoc_STR("columns(parents, children, stamps, rows, authority, static, square): the rows as a batch, or None if one "
+               "is not plain. They are normalised in place.")},
+    {"commit", FAST(commit), METH_FASTCALL,
+     PyDoc_STR("commit(frames, batch, first): store the samples from `first` to the first that is not plain; its "
+               "index.")},
+    {NULL}
+};
+
+static int
+add_type(PyObject *module, const char *name, PyType_Spec *spec, PyTypeObject **type)
+{
+    if (*type == NULL && (*type = (PyTypeObject *)PyType_FromSpec(spec)) == NULL) {
+        return -1;
+    }
+    return PyModule_AddObjectRef(module, name, (PyObject *)*type);
+}
+
+static int
+module_exec(PyObject *module)
+{
+    /* The types are shared by the whole process, as are those of numpy. */
+    if (PyInterpreterState_GetID(PyInterpreterState_Get()) != 0) {
+        PyErr_SetString(PyExc_ImportError, "the compiled kernel of tfbus runs in the main interpreter only");
+        return -1;
+    }
+    const struct {
+        const char *text;
+        PyObject **place;
+    } strings[] = {{"", &empty_string}, {"raise", &raise_string}, {"drop", &drop_string},
+                   {"at", &at_string}, {"_paths", &paths_string}, {"_memory", &memory_string}};
+    for (size_t i = 0; i < sizeof strings / sizeof *strings; i++) {
+        if (*strings[i].place == NULL && (*strings[i].place = PyUnicode_InternFromString(strings[i].text)) == NULL) {
+            return -1;
+        }
+    }
+    if (bound_method == NULL && (bound_method = imported("types", "MethodType")) == NULL) {
+        return -1;
+    }
+    if (add_type(module, "Sample", &sample_spec, &SampleType) < 0
+        || add_type(module, "Columns", &columns_spec, &ColumnsType) < 0
+        || add_type(module, "Block", &block_spec, &BlockType) < 0
+        || add_type(module, "History", &history_spec, &HistoryType) < 0
+        || add_type(module, "Chain", &chain_spec, &ChainType) < 0
+        || add_type(module, "Held", &held_spec, &HeldType) < 0
+        || add_type(module, "Paths", &paths_spec, &PathsType) < 0
+        || add_type(module, "Edge", &edge_spec, &EdgeType) < 0 || add_type(module, "Judge", &judge_spec, &JudgeType) < 0
+        || add_type(module, "Parked", &parked_spec, &ParkedType) < 0
+        || add_type(module, "Line", &line_spec, &LineType) < 0 || add_type(module, "Feed", &feed_spec, &FeedType) < 0
+        || add_type(module, "Intake", &intake_spec, &IntakeType) < 0
+        || add_type(module, "Method", &method_spec, &MethodType) < 0) {
+        return -1;
+    }
+    return 0;
+}
+
+static PyModuleDef_Slot module_slots[] = {{Py_mod_exec, module_exec}, {0, NULL}};
+
+static struct PyModuleDef module_definition = {
+    PyModuleDef_HEAD_INIT, "tfbus._kernel", PyDoc_STR("The compiled kernel of tfbus."), 0, module_methods, module_slots,
+    NULL, NULL, NULL
+};
+
+PyMODINIT_FUNC
+PyInit__kernel(void)
+{
+    return PyModuleDef_Init(&module_definition);
+}

@@ -1,0 +1,1036 @@
+/* Chains, paths and answers: from the histories between two frames to what a lookup returns.
+ *
+ * A Chain is the edges from the source up to the common ancestor and from the target up to it. Neighbouring static
+ * edges are one row. `chain_at` answers at one stamp; a Held is a look at the samples of all edges at one moment, and
+ * answers at many stamps, in columns of LANES rows, without the interpreter's lock.
+ *
+ * Paths is the cache {target: {source: Chain}} of a tree with its lock. It answers where a chain is known, covers the
+ * stamp, and nobody holds the lock; else Python looks closer: it finds the chain, applies the policy or words the error.
+ * Python clears the cache whenever a chain might not hold any more.
+ *
+ * A Method stands before a method in Python that has many options: a call without options is answered here, before the
+ * call costs anything, and any other call is passed on.
+ */
+
+/* Chain: the edges between two frames ------------------------------------------------------------------------------ */
+
+typedef struct {
+    History *edge; /* borrowed; NULL for a run of static edges, which is one row */
+    double row[WIDTH];
+} Step;
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *sides[2];   /* the steps from the source up and from the target up, as tuples, which own the edges */
+    Step *steps;          /* the same in a row */
+    Py_ssize_t up, down;  /* the number of each */
+    Py_ssize_t moving;    /* how many are edges */
+} Chain;
+
+static int
+chain_clear(Chain *self)
+{
+    Step *steps = self->steps;
+    self->steps = NULL;
+    self->up = self->down = self->moving = 0;
+    PyMem_Free(steps);
+    Py_CLEAR(self->sides[0]);
+    Py_CLEAR(self->sides[1]);
+    return 0;
+}
+
+static int
+chain_init(Chain *self, PyObject *args, PyObject *kwargs)
+{
+    PyObject *sides[2];
+    if (!has_no_keywords(kwargs)
+        || !PyArg_ParseTuple(args, "O!O!:Chain", &PyTuple_Type, &sides[0], &PyTuple_Type, &sides[1])) {
+        return -1;
+    }
+    const Py_ssize_t up = PyTuple_Size(sides[0]), down = PyTuple_Size(sides[1]);
+    Step *steps = PyMem_Calloc((size_t)(up + down + 1), sizeof(Step));
+    if (steps == NULL) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    Py_ssize_t moving = 0;
+    for (Py_ssize_t i = 0; i < up + down; i++) {
+        PyObject *step = i < up ? PyTuple_GetItem(sides[0], i) : PyTuple_GetItem(sides[1], i - up);
+        if (PyObject_TypeCheck(step, HistoryType)) {
+            steps[i].edge = (History *)step;
+            moving++;
+        } else if (read_row(step, steps[i].row) < 0) {
+            PyMem_Free(steps);
+            return -1;
+        }
+    }
+    /* Not before, because reading a row may run Python code. */
+    if (self->steps != NULL) {
+        PyMem_Free(steps);
+        PyErr_SetString(PyExc_RuntimeError, "a Chain is initialised once, because another thread may read it");
+        return -1;
+    }
+    Py_INCREF(sides[0]);
+    Py_INCREF(sides[1]);
+    self->sides[0] = sides[0];
+    self->sides[1] = sides[1];
+    self->steps = steps;
+    self->up = up;
+    self->down = down;
+    self->moving = moving;
+    return 0;
+}
+
+static const unsigned char each[LANES] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 11, 12, 13, 14, 15,
+                                          16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
+
+/* Source in target at a stamp. */
+static Status
+chain_at(const Chain *self, int64_t at, double *out)
+{
+    const Py_ssize_t steps = self->up + self->down;
+    double below[WIDTH];
+    memcpy(out, identity, ROW_SIZE);
+    for (Py_ssize_t first = 0; first < steps; first += LANES) {
+        const Py_ssize_t count = steps - first < LANES ? steps - first : LANES;
+        Segment segments[LANES];
+        Turn turns[LANES];
+        int64_t stamps[LANES];
+        double rows[LANES][WIDTH];
+        for (Py_ssize_t i = 0; i < count; i++) {
+            const Step *step = &self->steps[first + i];
+            stamps[i] = at;
+            if (step->edge == NULL) {
+                segments[i].a = NULL;
+                segments[i].b = step->row;
+                continue;
+            }
+            if (step->edge->mixed) {
+                return NOT_PLAIN;
+            }
+            const Samples samples = samples_of(step->edge);
+            const Status status = find_segment(&samples, at, &segments[i]);
+            if (status != ANSWERED) {
+                return status;
+            }
+        }
+        find_turns(segments, turns, count);
+        blend(segments, turns, each, stamps, count, rows[0], WIDTH, 1);
+        for (Py_ssize_t i = 0; i < count; i++) {
+            double *side = first + i < self->up ? out : below;
+            if (first + i == 0 || first + i == self->up) {
+                memcpy(side, rows[i], ROW_SIZE);
+            } else {
+                compose(rows[i], side, side);
+            }
+        }
+    }
+    if (self->down > 0) {
+        double inverse[WIDTH];
+        invert(below, inverse);
+        compose(inverse, out, out);
+    }
+    return ANSWERED;
+}
+
+/* Whether every edge has samples and something moves; then `stamp` is the newest one that all have reached. */
+static int
+chain_newest(const Chain *self, int64_t *stamp)
+{
+    int64_t common = INT64_MAX;
+    for (Py_ssize_t i = 0; i < self->up + self->down; i++) {
+        const History *edge = self->steps[i].edge;
+        if (edge == NULL) {
+            continue;
+        }
+        if (edge->end == edge->start) {
+            return 0;
+        }
+        const int64_t newest = block_stamps(edge->block)[edge->end - 1];
+        if (newest < common) {
+            common = newest;
+        }
+    }
+    *stamp = common;
+    return self->moving > 0;
+}
+
+static PyObject *
+chain_row(Chain *self, PyObject *number)
+{
+    int overflow;
+    double row[WIDTH];
+    const long long at = PyLong_AsLongLongAndOverflow(number, &overflow);
+    if (at == -1 && PyErr_Occurred()) {
+        return NULL;
+    }
+    if (overflow || chain_at(self, at, row) != ANSWERED) {
+        Py_RETURN_NONE;
+    }
+    return boxed_row(row);
+}
+
+static PyObject *
+chain_latest(Chain *self, PyObject *Py_UNUSED(ignored))
+{
+    int64_t stamp;
+    if (!chain_newest(self, &stamp)) {
+        Py_RETURN_NONE;
+    }
+    return PyLong_FromLongLong(stamp);
+}
+
+/* Held: the samples of a chain as they were at one moment, for many answers ----------------------------------------- */
+
+/* The state of each step of a chain; empty for static ones. */
+typedef struct {
+    Samples samples;
+    Segment last; /* the segment that was used last, which holds for all stamps between its two; none if equal */
+    Turn turn;    /* the turn of `last` */
+    Block *block; /* which it reads, or NULL */
+} Seen;
+
+typedef struct {
+    PyObject_HEAD
+    Chain *chain;
+    Seen *seen; /* one a step */
+    Py_ssize_t count; /* of these; the garbage collector may have cleared the chain before this ends */
+    char busy;  /* whether a thread works on `seen` */
+} Held;
+
+/* Note the samples of each edge as they are now; NULL without an error if an edge is not plain. */
+static Seen *
+chain_look(const Chain *self)
+{
+    const Py_ssize_t count = self->up + self->down;
+    Seen *seen = PyMem_Calloc((size_t)count + 1, sizeof(Seen));
+    if (seen == NULL) {
+        PyErr_NoMemory();
+        return NULL;
+    }
+    for (Py_ssize_t i = 0; i < count; i++) {
+        const History *edge = self->steps[i].edge;
+        if (edge != NULL) {
+            if (edge->mixed) {
+                PyMem_Free(seen);
+                return NULL;
+            }
+            seen[i].samples = samples_of(edge);
+        }
+    }
+    return seen;
+}
+
+/* Keep others from changing the samples that were noted, until `let_go`. */
+static void
+keep_hold(const Chain *chain, Seen *seen)
+{
+    for (Py_ssize_t i = 0; i < chain->up + chain->down; i++) {
+        Block *block = chain->steps[i].edge == NULL ? NULL : chain->steps[i].edge->block;
+        if (block != NULL) {
+            Py_INCREF(OBJECT(block));
+            block->readers++;
+            seen[i].block = block;
+        }
+    }
+}
+
+static void
+let_go(Seen *seen, Py_ssize_t count)
+{
+    for (Py_ssize_t i = 0; i < count; i++) {
+        if (seen[i].block != NULL) {
+            seen[i].block->readers--;
+            Py_DECREF(OBJECT(seen[i].block));
+        }
+    }
+    PyMem_Free(seen);
+}
+
+typedef double Column[LANES];
+
+static void
+fill_row(const double *row, Column *out, Py_ssize_t count)
+{
+    for (int k = 0; k < WIDTH; k++) {
+        for (Py_ssize_t j = 0; j < count; j++) {
+            out[k][j] = row[k];
+        }
+    }
+}
+
+/* The rows of an edge at some stamps. Where there is none, `missing` is set and the row is meaningless. */
+static Status
+edge_rows(Seen *edge, const int64_t *stamps, Py_ssize_t count, Column *out, char *missing)
+{
+    Segment segments[LANES + 1];
+    Turn turns[LANES + 1];
+    unsigned char which[LANES];
+    Py_ssize_t used = 1, last = 0;
+    segments[0] = edge->last;
+    turns[0] = edge->turn;
+    for (Py_ssize_t j = 0; j < count; j++) {
+        const int64_t at = stamps[j];
+        if (segments[last].before < at && at < segments[last].after) {
+            which[j] = (unsigned char)last;
+            continue;
+        }
+        Segment *segment = &segments[used];
+        const Status status = find_segment(&edge->samples, at, segment);
+        if (status == NOT_PLAIN) {
+            return NOT_PLAIN;
+        }
+        if (status == MISSING) {
+            missing[j] = 1;
+            segment->a = NULL;
+            segment->b = identity;
+        }
+        which[j] = (unsigned char)used;
+        last = segment->a == NULL ? last : used;
+        used++;
+    }
+    find_turns(segments + 1, turns + 1, used - 1);
+    blend(segments, turns, which, stamps, count, out[0], 1, LANES);
+    edge->last = segments[last];
+    edge->turn = turns[last];
+    return ANSWERED;
+}
+
+/* b = a @ b, or the inverse of a @ b. */
+static void
+compose_columns(Column *a, Column *b, Py_ssize_t count, int of_inverse)
+{
+    for (Py_ssize_t j = 0; j < count; j++) {
+        double first[WIDTH], second[WIDTH];
+        for (int k = 0; k < WIDTH; k++) {
+            first[k] = a[k][j];
+            second[k] = b[k][j];
+        }
+        if (of_inverse) {
+            invert(first, first);
+        }
+        compose(first, second, second);
+        for (int k = 0; k < WIDTH; k++) {
+            b[k][j] = second[k];
+        }
+    }
+}
+
+/* The answers at `count` stamps as seven columns; NaN where there is none. The first such place, -1 for none, or -2 if
+ * an answer is not plain. Neither `stamps` nor `columns` need be aligned. */
+static Py_ssize_t
+fill_columns(const Chain *self, Seen *seen, const char *stamps, Py_ssize_t count, char *columns)
+{
+    const Py_ssize_t steps = self->up + self->down;
+    Py_ssize_t first_missing = -1;
+    for (Py_ssize_t done = 0; done < count; done += LANES) {
+        const Py_ssize_t here = count - done < LANES ? count - done : LANES;
+        int64_t at[LANES];
+        char missing[LANES] = {0};
+        Column above[WIDTH], below[WIDTH], step[WIDTH];
+        memcpy(at, stamps + done * (Py_ssize_t)sizeof(int64_t), (size_t)here * sizeof(int64_t));
+        if (self->up == 0) {
+            fill_row(identity, above, here);
+        }
+        for (Py_ssize_t i = 0; i < steps; i++) {
+            const int begins = i == 0 || i == self->up;
+            Column *side = i < self->up ? above : below, *rows = begins ? side : step;
+            if (self->steps[i].edge == NULL) {
+                fill_row(self->steps[i].row, rows, here);
+            } else if (edge_rows(&seen[i], at, here, rows, missing) == NOT_PLAIN) {
+                return -2;
+            }
+            if (!begins) {
+                compose_columns(rows, side, here, 0);
+            }
+        }
+        if (self->down > 0) {
+            compose_columns(below, above, here, 1);
+        }
+        for (Py_ssize_t j = 0; j < here; j++) {
+            if (missing[j]) {
+                first_missing = first_missing < 0 ? done + j : first_missing;
+                for (int k = 0; k < WIDTH; k++) {
+                    above[k][j] = NAN;
+                }
+            }
+        }
+        for (int k = 0; k < WIDTH; k++) {
+            memcpy(columns + (k * count + done) * (Py_ssize_t)sizeof(double), above[k], (size_t)here * sizeof(double));
+        }
+    }
+    return first_missing;
+}
+
+enum { FEW_STAMPS = 256 }; /* for fewer answers, releasing the interpreter costs more than it gains */
+
+/* As `fill_columns`, of samples that others may not change: see Block. */
+static Py_ssize_t
+fill_columns_unlocked(Chain *chain, Seen *seen, const char *stamps, Py_ssize_t count, char *columns)
+{
+    Py_ssize_t missing;
+    if (count < FEW_STAMPS) {
+        return fill_columns(chain, seen, stamps, count, columns);
+    }
+    Py_BEGIN_ALLOW_THREADS
+    missing = fill_columns(chain, seen, stamps, count, columns);
+    Py_END_ALLOW_THREADS
+    return missing;
+}
+
+static PyObject *
+held_rows(Held *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    Py_buffer buffers[2], *const stamps = &buffers[0], *const columns = &buffers[1];
+    if (self->busy) {
+        PyErr_SetString(PyExc_RuntimeError, "another thread reads these samples");
+        return NULL;
+    }
+    if (!open_buffers(args, nargs, buffers, PyBUF_SIMPLE, PyBUF_WRITABLE)) {
+        return NULL;
+    }
+    PyObject *result = NULL;
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = stamps->len / size;
+    if (columns->len != count * (Py_ssize_t)ROW_SIZE || stamps->len % size != 0) {
+        PyErr_SetString(PyExc_ValueError, "columns must have room for seven floats a stamp");
+    } else {
+        self->busy = 1;
+        Py_INCREF(OBJECT(self));
+        const Py_ssize_t missing = fill_columns_unlocked(self->chain, self->seen, stamps->buf, count, columns->buf);
+        self->busy = 0;
+        Py_DECREF(OBJECT(self));
+        if (missing == -2) {
+            Py_INCREF(Py_None);
+            result = Py_None;
+        } else {
+            result = PyLong_FromSsize_t(missing);
+        }
+    }
+    close_buffers(buffers);
+    return result;
+}
+
+static int
+held_traverse(Held *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    Py_VISIT(self->chain);
+    return 0;
+}
+
+static void
+held_dealloc(Held *self)
+{
+    PyObject_GC_UnTrack(self);
+    if (self->seen != NULL) {
+        let_go(self->seen, self->count);
+    }
+    Py_XDECREF(OBJECT(self->chain));
+    let_go_of(OBJECT(self));
+}
+
+static PyMethodDef held_methods[] = {
+    {"rows", FAST(held_rows), METH_FASTCALL,
+     PyDoc_STR("rows(stamps, columns): fill columns of shape (7, n), NaN without an answer; the first such place, -1 if "
+               "there is none, None if an answer is not plain.")},
+    {NULL}
+};
+
+static PyType_Slot held_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The samples of a chain as they were at one moment.")},
+    {Py_tp_dealloc, held_dealloc},
+    {Py_tp_traverse, held_traverse},
+    {Py_tp_methods, held_methods},
+    {0, NULL}
+};
+
+static PyType_Spec held_spec = {
+    "tfbus._kernel.Held", sizeof(Held), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_DISALLOW_INSTANTIATION | Py_TPFLAGS_IMMUTABLETYPE, held_slots
+};
+
+static PyObject *
+chain_hold(Chain *self, PyObject *Py_UNUSED(ignored))
+{
+    Held *held = (Held *)PyType_GenericAlloc(HeldType, 0);
+    if (held == NULL) {
+        return NULL;
+    }
+    Py_INCREF(OBJECT(self));
+    held->chain = self;
+    held->count = self->up + self->down;
+    held->seen = chain_look(self);
+    if (held->seen == NULL) {
+        Py_DECREF(OBJECT(held));
+        if (PyErr_Occurred()) {
+            return NULL;
+        }
+        Py_RETURN_NONE;
+    }
+    keep_hold(self, held->seen);
+    return OBJECT(held);
+}
+
+static int
+chain_traverse(Chain *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    Py_VISIT(self->sides[0]);
+    Py_VISIT(self->sides[1]);
+    return 0;
+}
+
+static void
+chain_dealloc(Chain *self)
+{
+    PyObject_GC_UnTrack(self);
+    chain_clear(self);
+    let_go_of(OBJECT(self));
+}
+
+static PyMethodDef chain_methods[] = {
+    {"row", (PyCFunction)chain_row, METH_O, PyDoc_STR("row(at): source in target at a stamp; None if it is not plain.")},
+    {"latest", (PyCFunction)chain_latest, METH_NOARGS,
+     PyDoc_STR("The newest stamp that all edges have reached; None if one has no samples, or nothing moves.")},
+    {"hold", (PyCFunction)chain_hold, METH_NOARGS,
+     PyDoc_STR("The present samples of all edges, for many answers; None if they are not plain.")},
+    {NULL}
+};
+
+static PyMemberDef chain_members[] = {
+    {"up", T_OBJECT_EX, offsetof(Chain, sides[0]), READONLY, PyDoc_STR("The steps from the source up.")},
+    {"down", T_OBJECT_EX, offsetof(Chain, sides[1]), READONLY, PyDoc_STR("The steps from the target up.")},
+    {NULL}
+};
+
+static PyType_Slot chain_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The edges between two frames, and one row for each run of static ones.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_init, chain_init},
+    {Py_tp_dealloc, chain_dealloc},
+    {Py_tp_traverse, chain_traverse},
+    {Py_tp_clear, chain_clear},
+    {Py_tp_methods, chain_methods},
+    {Py_tp_members, chain_members},
+    {0, NULL}
+};
+
+static PyType_Spec chain_spec = {
+    "tfbus._kernel.Chain", sizeof(Chain), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, chain_slots
+};
+
+/* Paths: the plain answer ------------------------------------------------------------------------------------------ */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *recent;        /* {target: {source: Chain}} */
+    PyObject *lock_is_held;  /* the method of the tree's lock that says so */
+    PyObject *latest;        /* the sentinel */
+    PyObject *kind;          /* the class of an answer, made of Sample */
+    long long inserted;      /* samples at new stamps */
+    long long version;       /* another one after each change */
+} Paths;
+
+/* Whether nobody holds the lock. Its holder may be in the middle of a change, or of reading several histories. Nothing
+ * here lets go of the interpreter, so a free lock need not be taken. -1 for an error. */
+static int
+paths_are_free(const Paths *self)
+{
+    PyObject *held = PyObject_CallNoArgs(self->lock_is_held);
+    if (held == NULL) {
+        return -1;
+    }
+    Py_DECREF(held);
+    return held == Py_False;
+}
+
+REFERENCES(paths, 4)
+
+static int
+paths_init(Paths *self, PyObject *args, PyObject *kwargs)
+{
+    PyObject *lock, *latest, *kind;
+    if (!has_no_keywords(kwargs) || !PyArg_ParseTuple(args, "OOO!:Paths", &lock, &latest, &PyType_Type, &kind)) {
+        return -1;
+    }
+    if (!PyType_IsSubtype((PyTypeObject *)kind, SampleType)) {
+        PyErr_SetString(PyExc_TypeError, "answers must be samples");
+        return -1;
+    }
+    PyObject *is_held = PyObject_GetAttrString(lock, "locked");
+    PyObject *recent = is_held == NULL ? NULL : PyDict_New();
+    if (recent == NULL) {
+        Py_XDECREF(is_held);
+        return -1;
+    }
+    paths_clear(OBJECT(self));
+    self->recent = recent;
+    self->lock_is_held = is_held;
+    Py_INCREF(latest);
+    self->latest = latest;
+    Py_INCREF(kind);
+    self->kind = kind;
+    return 0;
+}
+
+/* The chain that is known between two frames, borrowed. NULL without an error if there is none, or somebody holds the
+ * lock. */
+static Chain *
+paths_find(const Paths *self, PyObject *target, PyObject *source)
+{
+    if (self->recent == NULL || !PyUnicode_CheckExact(target) || !PyUnicode_CheckExact(source)
+        || paths_are_free(self) <= 0) {
+        return NULL;
+    }
+    PyObject *by_source = PyDict_GetItemWithError(self->recent, target);
+    PyObject *chain = by_source == NULL ? NULL : PyDict_GetItemWithError(by_source, source);
+    return chain != NULL && PyObject_TypeCheck(chain, ChainType) ? (Chain *)chain : NULL;
+}
+
+/* None where Python has to look closer. */
+static PyObject *
+paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
+{
+    int64_t at;
+    double row[WIDTH];
+    if (count != 3) {
+        PyErr_SetString(PyExc_TypeError, "answer takes target, source and at");
+        return NULL;
+    }
+    PyObject *target = args[0], *source = args[1];
+    const Chain *path = paths_find(self, target, source);
+    if (path == NULL) {
+        if (PyErr_Occurred()) {
+            return NULL;
+        }
+        Py_RETURN_NONE;
+    }
+    if (args[2] == self->latest) {
+        if (!chain_newest(path, &at)) {
+            Py_RETURN_NONE;
+        }
+    } else {
+        int overflow;
+        if (path->moving == 0 || !PyLong_CheckExact(args[2])) {
+            Py_RETURN_NONE;
+        }
+        at = PyLong_AsLongLongAndOverflow(args[2], &overflow);
+        if (overflow) {
+            Py_RETURN_NONE;
+        }
+    }
+    if (chain_at(path, at, row) != ANSWERED) {
+        Py_RETURN_NONE;
+    }
+    Sample *sample = (Sample *)PyType_GenericAlloc((PyTypeObject *)self->kind, 0);
+    if (sample == NULL) {
+        return NULL;
+    }
+    Py_INCREF(target);
+    Py_INCREF(source);
+    Py_INCREF(empty_string);
+    sample->parent = target;
+    sample->child = source;
+    sample->authority = empty_string;
+    sample->stamp = at;
+    memcpy(sample->row, row, ROW_SIZE);
+    return (PyObject *)sample;
+}
+
+/* Bytes that end with the given stamps, and have room for seven floats a stamp before. NULL without an error if they
+ * are not a list or a tuple of int, or an array of int64; or if there are none. */
+static PyObject *
+room_for_rows(PyObject *stamps)
+{
+    const int is_list = PyList_CheckExact(stamps), is_tuple = PyTuple_CheckExact(stamps);
+    Py_buffer view = {0};
+    Py_ssize_t count;
+    if (is_list || is_tuple) {
+        count = is_list ? PyList_Size(stamps) : PyTuple_Size(stamps);
+    } else {
+        /* Not when the kernel is loaded, because `tfbus --version` does without numpy. */
+        if (array_type == NULL && (array_type = imported("numpy", "ndarray")) == NULL) {
+            return NULL;
+        }
+        /* Python judges arrays with a mask. */
+        if (OBJECT(Py_TYPE(stamps)) != array_type
+            && (!PyObject_CheckBuffer(stamps) || PyObject_HasAttrString(stamps, "mask"))) {
+            return NULL;
+        }
+        if (PyObject_GetBuffer(stamps, &view, PyBUF_STRIDES | PyBUF_FORMAT) < 0) {
+            if (PyErr_ExceptionMatches(PyExc_ValueError) || PyErr_ExceptionMatches(PyExc_TypeError)
+                || PyErr_ExceptionMatches(PyExc_BufferError)) {
+                PyErr_Clear();
+            }
+            return NULL;
+        }
+        const char *format = view.format == NULL ? "B" : view.format;
+        const int is_int64 = strcmp(format, "q") == 0 || (strcmp(format, "l") == 0 && sizeof(long) == sizeof(int64_t));
+        count = is_int64 && view.ndim == 1 && view.itemsize == (Py_ssize_t)sizeof(int64_t) ? view.shape[0] : 0;
+    }
+    PyObject *memory = NULL;
+    if (count > 0 && count <= PY_SSIZE_T_MAX / (Py_ssize_t)SAMPLE_SIZE / 2) {
+        memory = PyBytes_FromStringAndSize(NULL, count * (Py_ssize_t)SAMPLE_SIZE);
+    }
+    char *own = memory == NULL ? NULL : PyBytes_AsString(memory) + count * (Py_ssize_t)ROW_SIZE;
+    for (Py_ssize_t i = 0; own != NULL && i < count; i++) {
+        int64_t stamp;
+        if (is_list || is_tuple) {
+            PyObject *item = is_list ? PyList_GetItem(stamps, i) : PyTuple_GetItem(stamps, i);
+            int overflow = 1;
+            stamp = item != NULL && PyLong_CheckExact(item) ? PyLong_AsLongLongAndOverflow(item, &overflow) : 0;
+            if (overflow) {
+                Py_CLEAR(memory);
+                break;
+            }
+        } else {
+            memcpy(&stamp, (const char *)view.buf + i * view.strides[0], sizeof(stamp));
+        }
+        memcpy(own + i * (Py_ssize_t)sizeof(stamp), &stamp, sizeof(stamp));
+    }
+    if (view.obj != NULL) {
+        PyBuffer_Release(&view);
+    }
+    return memory;
+}
+
+/* None where Python has to look closer. */
+static PyObject *
+paths_answer_many(Paths *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 3) {
+        PyErr_SetString(PyExc_TypeError, "answer_many takes target, source and stamps");
+        return NULL;
+    }
+    /* Before all else, because it may run Python code. */
+    PyObject *memory = room_for_rows(args[2]);
+    Chain *path = memory == NULL ? NULL : paths_find(self, args[0], args[1]);
+    Seen *seen = path == NULL ? NULL : chain_look(path);
+    if (seen == NULL) {
+        Py_XDECREF(memory);
+        if (PyErr_Occurred()) {
+            return NULL;
+        }
+        Py_RETURN_NONE;
+    }
+    const Py_ssize_t count = PyBytes_Size(memory) / (Py_ssize_t)SAMPLE_SIZE;
+    char *columns = PyBytes_AsString(memory);
+    Py_INCREF(OBJECT(path));
+    if (count >= FEW_STAMPS) {
+        keep_hold(path, seen);
+    }
+    const Py_ssize_t missing = fill_columns_unlocked(path, seen, columns + count * (Py_ssize_t)ROW_SIZE, count, columns);
+    let_go(seen, path->up + path->down);
+    Py_DECREF(OBJECT(path));
+    if (missing != -1) {
+        Py_DECREF(memory);
+        Py_RETURN_NONE;
+    }
+    return memory;
+}
+
+/* commit(frames, readers, batch): store the whole batch if it is plain, the lock is free and there are no readers. */
+static PyObject *
+paths_commit(Paths *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 3 || !PyDict_Check(args[0]) || !PyDict_Check(args[1]) || !is_batch(args[2])) {
+        PyErr_SetString(PyExc_TypeError, "commit takes a dict of histories, a dict of readers and a batch");
+        return NULL;
+    }
+    if (self->recent == NULL || PyDict_Size(args[1]) > 0) {
+        Py_RETURN_FALSE;
+    }
+    const int free = paths_are_free(self);
+    if (free < 0) {
+        return NULL;
+    }
+    const Py_ssize_t size = batch_size(args[2]);
+    const Py_ssize_t end = free ? store(args[0], args[2], 0, 1) : 0;
+    if (end < 0) {
+        return NULL;
+    }
+    if (!free || end < size) {
+        Py_RETURN_FALSE;
+    }
+    self->inserted += size;
+    self->version++;
+    Py_RETURN_TRUE;
+}
+
+static PyObject *
+paths_recent(Paths *self, void *Py_UNUSED(closure))
+{
+    if (self->recent == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "recent");
+        return NULL;
+    }
+    Py_INCREF(self->recent);
+    return self->recent;
+}
+
+static int
+paths_set_recent(Paths *self, PyObject *value, void *Py_UNUSED(closure))
+{
+    if (value == NULL || !PyDict_CheckExact(value)) {
+        PyErr_SetString(PyExc_TypeError, "recent must be a dict");
+        return -1;
+    }
+    PyObject *old = self->recent;
+    Py_INCREF(value);
+    self->recent = value;
+    Py_XDECREF(OBJECT(old));
+    return 0;
+}
+
+static PyMethodDef paths_methods[] = {
+    {"answer", FAST(paths_answer), METH_FASTCALL,
+     PyDoc_STR("answer(target, source, at): the plain answer; None if Python has to look closer.")},
+    {"answer_many", FAST(paths_answer_many), METH_FASTCALL,
+     PyDoc_STR("answer_many(target, source, stamps): the plain answers as bytes, seven columns of floats, and the stamps; "
+               "None if Python has to look closer.")},
+    {"commit", FAST(paths_commit), METH_FASTCALL,
+     PyDoc_STR("commit(frames, readers, batch): store a batch if it is plain and has no readers; else nothing.")},
+    {NULL}
+};
+
+static PyGetSetDef paths_getset[] = {
+    {"recent", (getter)paths_recent, (setter)paths_set_recent, PyDoc_STR("{target: {source: Chain}}"), NULL},
+    {NULL}
+};
+
+static PyMemberDef paths_members[] = {
+    {"inserted", T_LONGLONG, offsetof(Paths, inserted), 0, PyDoc_STR("The number of samples at new stamps.")},
+    {"version", T_LONGLONG, offsetof(Paths, version), 0, PyDoc_STR("Another number after each change.")},
+    {NULL}
+};
+
+static PyType_Slot paths_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The paths that were asked for lately, and their plain answers.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_init, paths_init},
+    {Py_tp_dealloc, paths_dealloc},
+    {Py_tp_traverse, paths_traverse},
+    {Py_tp_clear, paths_clear},
+    {Py_tp_methods, paths_methods},
+    {Py_tp_members, paths_members},
+    {Py_tp_getset, paths_getset},
+    {0, NULL}
+};
+
+static PyType_Spec paths_spec = {
+    "tfbus._kernel.Paths", sizeof(Paths), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, paths_slots
+};
+
+/* Method: a method in Python that runs only if there is no plain answer ----------------------------------------------- */
+
+typedef struct Method {
+    PyObject_HEAD
+    PyObject *function; /* the method in Python */
+    PyObject *many;     /* the class of the answers at many stamps; NULL if it asks for one */
+    PyObject *defaults; /* the defaults of its keywords, a dict or None */
+    PyObject *(*vectorcall)(struct Method *, PyObject *const *, size_t, PyObject *);
+} Method;
+
+/* Py_TPFLAGS_HAVE_VECTORCALL, which has this value since 3.8, and is in the limited API since 3.12. */
+#define HAVE_VECTORCALL (1UL << 11)
+
+static PyObject *method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject *names);
+
+REFERENCES(method, 3)
+
+static PyObject *
+method_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
+{
+    PyObject *function, *many;
+    if (!has_no_keywords(kwargs) || !PyArg_ParseTuple(args, "OO:Method", &function, &many)) {
+        return NULL;
+    }
+    if (many != Py_None && !PyType_Check(many)) {
+        PyErr_SetString(PyExc_TypeError, "the answers at many stamps need a class, or None");
+        return NULL;
+    }
+    PyObject *defaults = PyObject_GetAttrString(function, "__kwdefaults__");
+    if (defaults == NULL) {
+        return NULL;
+    }
+    Method *self = (Method *)PyType_GenericAlloc(type, 0);
+    if (self == NULL) {
+        Py_DECREF(defaults);
+    } else {
+        Py_INCREF(function);
+        self->function = function;
+        self->defaults = defaults;
+        self->vectorcall = method_vectorcall;
+        Py_XINCREF(many == Py_None ? NULL : many);
+        self->many = many == Py_None ? NULL : many;
+    }
+    return OBJECT(self);
+}
+
+/* The plain answer for source in target; None if there is none. Without stamps it is the latest. */
+static PyObject *
+method_answer(const Method *self, PyObject *asker, PyObject *target, PyObject *source, PyObject *at)
+{
+    PyObject *paths = PyObject_GetAttr(asker, paths_string);
+    if (paths == NULL || !PyObject_TypeCheck(paths, PathsType)) {
+        PyErr_Clear();
+        Py_XDECREF(paths);
+        Py_RETURN_NONE;
+    }
+    PyObject *question[3] = {target, source, at == NULL ? ((Paths *)paths)->latest : at};
+    PyObject *found = self->many == NULL ? paths_answer((Paths *)paths, question, 3)
+                                         : paths_answer_many((Paths *)paths, question, 3);
+    Py_DECREF(paths);
+    if (self->many == NULL || found == NULL || found == Py_None) {
+        return found;
+    }
+    PyObject *answers = PyType_GenericAlloc((PyTypeObject *)self->many, 0);
+    if (answers != NULL && PyObject_SetAttr(answers, memory_string, found) < 0) {
+        Py_CLEAR(answers);
+    }
+    Py_DECREF(found);
+    return answers;
+}
+
+/* The call of the method in Python, with `count` arguments and as many more as there are names. */
+static PyObject *
+method_run(const Method *self, PyObject *const *args, Py_ssize_t count, PyObject *names)
+{
+    PyObject *first = PyTuple_New(count), *result = NULL;
+    PyObject *named = first == NULL || names == NULL ? NULL : PyDict_New();
+    int failed = first == NULL || (names != NULL && named == NULL) || self->function == NULL;
+    for (Py_ssize_t i = 0; !failed && i < count; i++) {
+        Py_INCREF(args[i]);
+        failed = PyTuple_SetItem(first, i, args[i]) < 0;
+    }
+    for (Py_ssize_t i = 0; !failed && names != NULL && i < PyTuple_Size(names); i++) {
+        failed = PyDict_SetItem(named, PyTuple_GetItem(names, i), args[count + i]) < 0;
+    }
+    if (!failed) {
+        result = PyObject_Call(self->function, first, named);
+    } else if (!PyErr_Occurred()) {
+        PyErr_SetString(PyExc_RuntimeError, "the garbage collector has taken the method");
+    }
+    Py_XDECREF(first);
+    Py_XDECREF(named);
+    return result;
+}
+
+/* Whether the named arguments from the index `first` on are the defaults of the method. Inlined, it would cost each call
+ * without names a twentieth of its time: more registers are saved. */
+Py_NO_INLINE static int
+method_has_defaults(const Method *self, PyObject *const *named, PyObject *names, Py_ssize_t first)
+{
+    const Py_ssize_t size = PyTuple_Size(names);
+    for (Py_ssize_t i = first; i < size; i++) {
+        if (self->defaults == NULL || !PyDict_CheckExact(self->defaults)
+            || PyDict_GetItem(self->defaults, PyTuple_GetItem(names, i)) != named[i]) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* By PEP 590. A plain call has only the object, target, source, and the stamp or stamps; all else are defaults. */
+static PyObject *
+method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject *names)
+{
+    const Py_ssize_t count = (Py_ssize_t)(flagged & ~((size_t)1 << (8 * sizeof(size_t) - 1)));
+    const int at_is_named = count == 3 && names != NULL && PyTuple_Size(names) > 0 && PyTuple_GetItem(names, 0) == at_string;
+    if ((count == 4 || (self->many == NULL && count == 3))
+        && (names == NULL || method_has_defaults(self, args + count, names, at_is_named))) {
+        PyObject *found = method_answer(self, args[0], args[1], args[2], count == 4 || at_is_named ? args[3] : NULL);
+        if (found != Py_None) {
+            return found;
+        }
+        Py_DECREF(found);
+    }
+    return method_run(self, args, count, names);
+}
+
+static PyObject *
+method_call(Method *self, PyObject *args, PyObject *kwargs)
+{
+    if (self->function == NULL) {
+        return method_run(self, NULL, 0, NULL);
+    }
+    return PyObject_Call(self->function, args, kwargs);
+}
+
+static PyObject *
+method_bind(PyObject *self, PyObject *instance, PyObject *Py_UNUSED(owner))
+{
+    if (instance == NULL || instance == Py_None) {
+        Py_INCREF(self);
+        return self;
+    }
+    return PyObject_CallFunctionObjArgs(bound_method, self, instance, NULL);
+}
+
+/* Attributes come from the method in Python, so that its signature and its documentation are found. */
+static PyObject *
+method_attribute(Method *self, PyObject *name)
+{
+    PyObject *found = self->function == NULL ? NULL : PyObject_GetAttr(self->function, name);
+    if (found == NULL) {
+        PyErr_Clear();
+        found = PyObject_GenericGetAttr(OBJECT(self), name);
+    }
+    return found;
+}
+
+static PyMemberDef method_members[] = {
+    {"__wrapped__", T_OBJECT_EX, offsetof(Method, function), READONLY, PyDoc_STR("The method in Python.")},
+    {"__vectorcalloffset__", T_PYSSIZET, offsetof(Method, vectorcall), READONLY, NULL},
+    {NULL}
+};
+
+static PyType_Slot method_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("Method(function, many): a method that runs only if there is no plain answer.")},
+    {Py_tp_new, method_new},
+    {Py_tp_dealloc, method_dealloc},
+    {Py_tp_traverse, method_traverse},
+    {Py_tp_clear, method_clear},
+    {Py_tp_call, method_call},
+    {Py_tp_descr_get, method_bind},
+    {Py_tp_getattro, method_attribute},
+    {Py_tp_members, method_members},
+    {0, NULL}
+};
+
+static PyType_Spec method_spec = {
+    "tfbus._kernel.Method", sizeof(Method), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_METHOD_DESCRIPTOR | HAVE_VECTORCALL | Py_TPFLAGS_IMMUTABLETYPE,
+    method_slots
+};
+
+/* Poses relative to each other ---------------------------------------------------------------------------------------- */
+
+static PyObject *
+compose_paths(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    Py_buffer buffers[2], *const rows = &buffers[0], *const origins = &buffers[1];
+    if (!open_buffers(args, nargs, buffers, PyBUF_WRITABLE, PyBUF_SIMPLE)) {
+        return NULL;
+    }
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = origins->len / size;
+    const int fits = origins->len % size == 0 && rows->len % (Py_ssize_t)ROW_SIZE == 0
+                     && rows->len / (Py_ssize_t)ROW_SIZE == count;
+    Py_ssize_t i = 0;
+    for (; fits && i < count; i++) {
+        const int64_t origin = ((const int64_t *)origins->buf)[i];
+        if (origin < 0 || (origin > 0 && origin >= i)) {
+            break;
+        }
+        if (origin > 0) {
+            double *row = (double *)rows->buf + WIDTH * i;
+            compose((const double *)rows->buf + WIDTH * origin, row, row);
+        }
+    }
+    close_buffers(buffers);
+    if (!fits || i < count) {
+        PyErr_SetString(PyExc_ValueError, "each row of seven floats needs an origin before it");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
