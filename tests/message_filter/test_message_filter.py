@@ -613,6 +613,37 @@ def test_changing_to_a_wrong_target_is_an_error(
 # Plain asyncio
 
 
+@pytest.mark.parametrize("around", ["timeout", "wait_for"])
+def test_an_asyncio_timeout_around_a_filter_raises_a_timeout_error(around: str) -> None:
+    buffer = Buffer(Bus())
+    left: list[int] = []
+
+    async def endless() -> None:
+        send, receive = anyio.create_memory_object_stream[Scan](10)
+        with send, receive:
+            send.send_nowait(Scan(5))
+            try:
+                async with MessageFilter(receive, buffer, "map") as pairs:
+                    await read(pairs, [])
+            finally:
+                left.append(pairs.dropped["closed"])
+
+    async def main() -> None:
+        with pytest.raises(TimeoutError):
+            if around == "wait_for":
+                await asyncio.wait_for(endless(), 0.1)
+            else:
+                async with asyncio.timeout(0.1):
+                    await endless()
+        task = asyncio.current_task()
+        assert task is not None
+        assert task.cancelling() == 0
+        assert (left, buffer.pending()) == ([1], ())
+        assert asyncio.all_tasks() == {task}
+
+    asyncio.run(main())
+
+
 @pytest.mark.parametrize("where", ["waiting", "in the body", "with an answer"])
 def test_a_cancelled_asyncio_task_with_a_filter_is_cancelled(where: str) -> None:
     bus = Bus(SimulatedClock())
