@@ -18,7 +18,6 @@ from tfbus import (
     Buffer,
     Bus,
     BusClosedError,
-    Clock,
     ClockResetError,
     DisconnectedError,
     FutureExtrapolationError,
@@ -28,7 +27,6 @@ from tfbus import (
     PointStamped,
     Question,
     SimulatedClock,
-    SystemClock,
     TransformStamped,
     UnknownFrameError,
     do_transform,
@@ -331,24 +329,6 @@ async def test_closing_ends_waits_and_buffered_samples_can_still_be_looked_up(
         await buffer.lookup("map", "a", 2 * SECOND)
     with pytest.raises(PastExtrapolationError):
         await buffer.lookup("map", "a", 0)
-
-
-@pytest.mark.parametrize("clock", [SystemClock(), SimulatedClock()], ids=lambda clock: type(clock).__name__)
-async def test_a_closed_buffer_gets_no_more_samples_and_others_do(clock: Clock) -> None:
-    # On the clock of the system, the second sample of a frame takes a shorter way.
-    bus = Bus(clock)
-    closed = Buffer(bus)
-    with Buffer(bus) as buffer:
-        for stamp in (0, 1):
-            bus.publish(moving("map", "a", stamp))
-        closed.close()
-        bus.publish(moving("map", "a", 2))
-        assert buffer.lookup_nowait("map", "a").stamp == 2
-        bus.remove_frame("a")
-        assert (await closed.lookup("map", "a")).stamp == 1
-        assert not buffer.can_transform("map", "a")
-        assert len(bus.statistics().buffers) == 1
-    assert bus.statistics().buffers == ()
 
 
 @pytest.mark.parametrize("keep", [-1.0, math.nan])

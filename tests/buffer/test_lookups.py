@@ -1,7 +1,6 @@
 """Alarms on a loop whose time stands still until the test moves it, and on the loops that there are."""
 
 import gc
-import random
 from contextlib import suppress
 from functools import partial
 from itertools import permutations, product
@@ -114,21 +113,6 @@ def test_one_timer_serves_all_alarms_that_follow_each_other() -> None:
         loop.move(0.001)
     assert loop.set == 1
     assert len(heap) < 200
-
-
-def test_alarms_ring_in_order_when_most_others_were_cancelled() -> None:
-    loop = HandLoop()
-    heap = AlarmHeap(loop)
-    rung: list[int] = []
-    times = random.Random(1).sample(range(1_000), 500)
-    cancels = {time: heap.add(time, partial(rung.append, time)) for time in times}
-    kept = times[::10]
-    for time in cancels.keys() - set(kept):
-        cancels[time]()
-    heap.add(1_000.0, list)
-    assert len(heap) < 100
-    loop.move(1_000.0)
-    assert rung == sorted(kept)
 
 
 def test_an_alarm_that_raises_is_logged_and_keeps_the_later_ones(caplog: pytest.LogCaptureFixture) -> None:

@@ -218,17 +218,6 @@ async def test_a_slow_reader_gets_the_newest_answer_and_skipped_updates_are_coun
         assert ((await anext(changes)).stamp, changes.skipped) == (13, 11)
 
 
-async def test_a_batch_with_several_samples_on_the_path_is_one_update() -> None:
-    _, bus, buffer = make()
-    bus.publish([moving("map", "a", 0), moving("a", "b", 0)])
-    with buffer.watch("map", "b") as changes:
-        await anext(changes)
-        bus.publish(
-            [moving(parent, child, stamp) for stamp in (1, 2, 3) for parent, child in (("map", "a"), ("a", "b"))]
-        )
-        assert ((await anext(changes)).stamp, changes.skipped) == (3, 0)
-
-
 # Waking
 
 

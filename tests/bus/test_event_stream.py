@@ -5,18 +5,14 @@ from collections.abc import Callable
 
 import anyio
 import pytest
-from support.asking import Asked, driving, settle
+from support.asking import Asked, settle
 from support.samples import moving, static
 
 from tfbus import (
-    SECOND,
     Bus,
     Event,
     EventStream,
     FrameAdded,
-    FrameLive,
-    FrameRemoved,
-    FrameStale,
     InvalidTransformError,
     PastLoop,
     QueueStatistics,
@@ -28,29 +24,7 @@ from tfbus.bus.event_stream import EventQueue
 
 pytestmark = pytest.mark.anyio
 
-Events = list[Event]
 ENDS: list[Callable[[Bus, EventStream], None]] = [lambda bus, _: bus.close(), lambda _, events: events.close()]
-
-
-async def read(events: EventStream, got: Events) -> None:
-    async for event in events:
-        got.append(event)
-
-
-@pytest.mark.every_loop
-async def test_a_waiting_reader_gets_each_event_of_the_bus() -> None:
-    bus = Bus(SimulatedClock(start=5))
-    got: Events = []
-    async with anyio.create_task_group() as tasks:
-        with bus.events() as events:
-            tasks.start_soon(read, events, got)
-            await settle()
-            bus.publish(moving("map", "base", 5, authority="odometry"))
-            await settle()
-            assert got == [FrameAdded(5, "base", "map", "odometry", static=False)]
-            bus.remove_frame("base")
-            await settle()
-            assert got[1:] == [FrameRemoved(5, "base")]
 
 
 async def test_events_that_a_slow_reader_misses_are_counted_in_the_statistics() -> None:
@@ -68,62 +42,7 @@ async def test_events_that_a_slow_reader_misses_are_counted_in_the_statistics() 
 # Stale and live
 
 
-async def test_a_waiting_reader_gets_a_stale_frame_at_the_very_time_of_the_limit_also_after_a_jump() -> None:
-    clock = SimulatedClock()
-    bus = Bus(clock)
-    got: Events = []
-    async with anyio.create_task_group() as tasks:
-        with bus.events(stale_after=1.5) as events:
-            tasks.start_soon(read, events, got)
-            bus.publish(driving("map", "base", 0.0, "odometry"))
-            await clock.advance(1.5)
-            assert len(got) == 1
-            await clock.advance(10.0)
-            stale = SECOND * 3 // 2 + 1
-            assert got[1:] == [FrameStale(stale, "base", 0, "odometry")]
-            bus.publish(driving("map", "base", 11.5, "odometry"))
-            await settle()
-            assert got[2:] == [FrameLive(23 * SECOND // 2, "base", 23 * SECOND // 2, "odometry")]
-            clock.set(60 * SECOND)
-            await settle()
-            assert got[3:] == [FrameStale(60 * SECOND, "base", 23 * SECOND // 2, "odometry")]
-
-
-async def test_events_during_the_reading_of_stale_events_come_after_them_and_displace_none() -> None:
-    clock = SimulatedClock()
-    bus = Bus(clock)
-    bus.publish(driving("map", name, 0.0) for name in "abc")
-    with bus.events(capacity=1) as events:
-        for _ in "abc":
-            assert isinstance(await anext(events), FrameAdded)
-        await clock.advance(5.0)
-        assert await anext(events) == FrameStale(5 * SECOND, "a", 0, "")
-        bus.remove_frame("b")
-        bus.publish(driving("map", "c", 5.0))
-        assert [await anext(events) for _ in range(4)] == [
-            FrameStale(5 * SECOND, "b", 0, ""),
-            FrameStale(5 * SECOND, "c", 0, ""),
-            FrameRemoved(5 * SECOND, "b"),
-            FrameLive(5 * SECOND, "c", 5 * SECOND, ""),
-        ]
-
-
 # The end
-
-
-@pytest.mark.parametrize("end", ENDS)
-async def test_a_closed_stream_ends_after_the_pending_events(end: Callable[[Bus, EventStream], None]) -> None:
-    clock = SimulatedClock()
-    bus = Bus(clock)
-    events = bus.events()
-    bus.publish(driving("map", "base", 0.0))
-    end(bus, events)
-    await clock.advance(100.0)
-    got: Events = []
-    await read(events, got)
-    assert [type(event) for event in got] == [FrameAdded]
-    with pytest.raises(StopAsyncIteration):
-        await anext(events)
 
 
 async def test_the_error_of_a_rejection_event_has_no_traceback_into_the_sender() -> None:

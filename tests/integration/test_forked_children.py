@@ -117,9 +117,7 @@ for kind in {list(ENTERED.values())}:
     assert lines == []
 
 
-def test_a_child_cannot_use_the_threads_and_links_of_its_parent_nor_enter_one_of_zenoh_and_ends_without_waiting() -> (
-    None
-):
+def test_a_child_cannot_use_the_threads_and_links_of_its_parent_nor_enter_one_of_zenoh() -> None:
     lines = said(f"""
 async def enter(link):
     async with link:

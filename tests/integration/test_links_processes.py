@@ -24,8 +24,6 @@ BLOCKED = 3.0
 """The seconds for which a slow process does not return to its event loop."""
 RATE = 500 / 3
 """Batches of 20 that each of three processes sends a second: 10,000 samples a second in all."""
-SOON = 3.0
-"""s; so long after the end of a trouble everything is told."""
 
 
 @pytest.fixture
@@ -96,23 +94,6 @@ def test_a_ring_of_three_domains_brings_every_sample_once(processes: Crowd) -> N
     send_in_turn(members)
 
 
-@thorough
-def test_processes_may_start_in_any_order(processes: Crowd, place: Place) -> None:
-    late = processes.add(place.other())
-    late.ask("statics", names=["before"])
-    first = processes.add(place.first())
-    first.ask("until", static=["before"])
-    first.ask("statics", names=["after"])
-    late.ask("until", static=["after"])
-    # The first one may end and come back.
-    first.kill()
-    late.wait(event="PeerLost")
-    again = processes.add(place.first(), backend="trio")
-    again.ask("until", static=["before"])
-    again.ask("statics", names=["again"])
-    late.ask("until", static=["again"])
-
-
 @pytest.mark.parametrize("drop_lost", [False, pytest.param(True, marks=thorough)])
 def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_and_for_late_joiners(
     drop_lost: bool, processes: Crowd, place: Place
@@ -148,26 +129,6 @@ def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_and_f
     latest = processes.add(place.other(drop_lost=drop_lost))
     latest.ask("until", x={name: x for name, x in kept.items() if name != "lidar"}, peers=3)
     assert "lidar" not in latest.ask("facts")["x"]
-
-
-@thorough
-@pytest.mark.parametrize("seconds", [1.5, 12.0])
-def test_a_frame_that_moves_once_while_a_peer_is_frozen_comes_to_it(
-    seconds: float, processes: Crowd, place: Place
-) -> None:
-    broadcaster, frozen, other = (processes.add(link) for link in (place.first(), place.other(), place.other()))
-    meet(broadcaster, frozen, other)
-    frozen.signal(signal.SIGSTOP)
-    time.sleep(seconds / 2)
-    broadcaster.ask("publish", samples=[moving("goal", 1.0)])
-    broadcaster.ask("statics", names=["lidar"], x=2.0)
-    other.ask("until", x={"goal": 1.0, "lidar": 2.0})
-    time.sleep(seconds / 2)
-    frozen.signal(signal.SIGCONT)
-    assert frozen.ask("until", x={"goal": 1.0, "lidar": 2.0}, peers=2)["seconds"] < SOON
-    if place.carrier == "local":
-        # The kernel knows that it lives.
-        assert not other.said(event="PeerLost")
 
 
 @thorough

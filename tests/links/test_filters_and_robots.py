@@ -3,7 +3,7 @@
 from typing import Any
 
 import pytest
-from support.domains import Network, Process, Stranger, World, agree
+from support.domains import Network, Process, Stranger, World
 from support.memory_wire import MemoryNetwork
 from support.samples import moving, static
 
@@ -59,33 +59,6 @@ def test_a_link_for_some_frames_sends_and_takes_these_only_and_peers_send_it_no_
     assert one.frames.keys() == {"arm", "base", "own"}
     assert some.end.messages - before <= 25
     assert (some.end.lost, some.end.rejected) == (0, {})
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_a_filtered_link_has_its_frames_after_any_loss_and_the_others_theirs_of_it(seed: int) -> None:
-    world = World(seed)
-    network = Network(world)
-    one, other = world.process(network), world.process(network)
-    some = world.process(network, frames=["a", "b", "mine"])
-    world.run(5.0)
-    network.loss = 0.5
-    for number, name in enumerate("abcd" * 20):
-        (one, other)[number % 2].say(static("map", name, float(number)))
-        some.say(static("map", "mine", float(number)))
-        world.run(0.05)
-    other.remove("b")
-    network.heal()
-    world.run(10.0)
-    assert agree([one, other])
-    assert some.frames.keys() == {"a", "mine"}
-    assert [some.frames[name] for name in ("a", "mine")] == [one.frames[name] for name in ("a", "mine")]
-    late = world.process(network, frames=["mine", "c"])
-    world.run(3.0)
-    assert late.frames == {name: one.frames[name] for name in ("mine", "c")}
-    network.carried.clear()
-    world.run(60.0)
-    # Only the two whose filters differ ask each other, now and then.
-    assert network.sent(Kind.QUESTION) <= 4
 
 
 @pytest.mark.parametrize("how_many", [1, 3])

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from tfbus.links.link import MANY, ReceiveQueue
 from tfbus.links.seams import Presence, Received
-from tfbus.statistics import QueueStatistics
 
 MIB = 2**20
 ROOM = 64 * MIB
@@ -115,15 +114,6 @@ def test_nothing_is_lost_and_of_each_peer_only_its_coming_overtakes(steps: list[
         assert [item for item in got[sender] if item[1] is not Presence.JOINED] == in_order
 
 
-def test_items_that_do_not_move_take_no_room_from_moving_ones() -> None:
-    queue = ReceiveQueue(1)
-    for number in range(10_000):
-        queue.put(kept(number))
-    queue.put(moving("last"))
-    assert queue.statistics().dropped == 0
-    assert drained(queue) == [*range(10_000), "last"]
-
-
 def test_beyond_the_bytes_moving_items_are_dropped_first_and_then_the_oldest_of_the_others() -> None:
     queue = ReceiveQueue(1_000)
     for number in range(3):
@@ -155,15 +145,6 @@ def test_an_item_may_fill_all_the_room_that_is_left(end: str) -> None:
     assert (len(queue), queue.statistics().dropped) == (0, dropped + 1)
 
 
-def test_reading_frees_room() -> None:
-    queue = ReceiveQueue(2)
-    for number in range(1_000):
-        queue.put(moving(number, 16 * MIB))
-        queue.put(kept(number, 16 * MIB))
-        assert drained(queue) == [number, number]
-    assert queue.statistics().dropped == 0
-
-
 @pytest.mark.thorough
 def test_the_number_of_items_without_content_is_bounded_too() -> None:
     queue = ReceiveQueue(1)
@@ -172,24 +153,6 @@ def test_the_number_of_items_without_content_is_bounded_too() -> None:
     statistics = queue.statistics()
     assert statistics.pending <= 300_000
     assert statistics.pending + statistics.dropped == 400_000
-
-
-def test_discarding_moving_items_counts_them_as_dropped() -> None:
-    queue = ReceiveQueue(3)
-    for item in (kept("a", MIB), moving(1, MIB), moving(2), moving(3), kept("b"), moving(4)):
-        queue.put(item)
-    queue.discard_moving()
-    assert queue.statistics() == QueueStatistics("link", "drop_oldest", 3, pending=2, dropped=4)
-    for number in range(3):
-        queue.put(moving(number))
-    assert queue.statistics().dropped == 4
-    assert drained(queue) == ["a", "b", 0, 1, 2]
-    queue = ReceiveQueue(1_000)
-    for item in (*map(moving, range(MANY + 1)), LEFT, moving(-1)):
-        queue.put(item)
-    queue.discard_moving()
-    assert queue.statistics() == QueueStatistics("link", "drop_oldest", 1_000, pending=1, dropped=MANY + 2)
-    assert drained(queue) == [Presence.LEFT]
 
 
 STEPS = st.lists(st.sampled_from(("moving", "kept", "get", "get", "discard")), max_size=60)

@@ -318,17 +318,6 @@ async def test_a_seek_begins_with_the_static_transforms_and_only_one_back_is_an_
     assert player.passes == 1
 
 
-async def test_a_seek_before_it_plays_is_where_it_begins_once(bus: Bus, tmp_path: Path) -> None:
-    entries = drive(range(5))
-    path = write_recording(tmp_path / "run.mcap", *entries)
-    heard = Listener(bus)
-    player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE)
-    player.seek(START + 3 * SECOND)
-    await player.play()
-    await player.play()
-    assert heard.entries == [*entries[3:], *entries]
-
-
 async def test_a_seek_behind_the_end_does_not_end_a_loop(bus: Bus, tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive(range(5)))
     heard = Listener(bus)
@@ -436,30 +425,6 @@ def test_a_paused_player_that_waits_is_woken_by_what_makes_it_go_on(
 
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
     assert times_in(path, steer, simulated=simulated) == pytest.approx([0.0, 100.0 + left], abs=1e-6)
-
-
-@pytest.mark.parametrize("simulated", [True, False])
-def test_a_seek_is_followed_at_once_and_a_pause_lasts_beyond_it(tmp_path: Path, simulated: bool) -> None:
-    async def steer(player: Player, heard: Listener) -> None:
-        await heard.until(1)
-        await anyio.sleep(3.0)
-        player.seek(START + 1_000 * SECOND)
-        await heard.until(2)
-        player.pause()
-        await anyio.sleep(100.0)
-        player.seek(START + 1_000 * SECOND)
-        await anyio.sleep(100.0)
-        player.step()
-        await heard.until(3)
-        player.seek(START + 1_999 * SECOND)
-        player.resume()
-        await heard.until(4)
-        assert heard.batches == [(moving("map", "base", START + x * SECOND, float(x), "odometry"),) for x in stops]
-
-    stops = (0, 1_000, 1_000, 2_000)
-    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1_000.0, 2_000.0)))
-    # The second at once, the third when the step is taken; of the last, a second is left.
-    assert times_in(path, steer, simulated=simulated) == pytest.approx([0.0, 3.0, 203.0, 204.0], abs=1e-6)
 
 
 def test_a_simulated_clock_advances_steadily_between_messages(tmp_path: Path) -> None:

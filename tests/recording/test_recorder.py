@@ -1,9 +1,7 @@
 """A bus is recorded: in order, within bounds, and whole whatever happens."""
 
-import asyncio
 import os
 import random
-import signal
 import subprocess
 import sys
 import threading
@@ -149,18 +147,6 @@ async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(bus: Bus,
                 assert [error.reason for error in unfinished.errors] == ["unfinished"]
                 assert not recording.finished
     await recorder.flush()
-
-
-async def test_a_flush_writes_all_that_is_pending_in_whatever_parts(bus: Bus, path: Path) -> None:
-    async with Recorder(bus, path) as recorder:
-        # A slice has 4,096 samples; a quarter of that is left for a second one.
-        for number in range(5_120):
-            bus.publish(moving("map", "a", number))
-        await recorder.flush()
-        assert recorder.statistics().queue.pending == 0
-        with open_recording(path) as recording:
-            # And the report that the file is not finished.
-            assert sum(map(len, recording.blocks())) == 5_120 + 1
 
 
 async def test_a_flush_does_not_wait_for_what_comes_meanwhile(path: Path) -> None:
@@ -423,20 +409,6 @@ def test_all_samples_but_the_last_ones_can_be_read_after_sigkill(path: Path, bac
     ]
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_ctrl_c_leaves_a_whole_file(path: Path, backend: str) -> None:
-    command = [sys.executable, "-c", KILLED, str(path), backend]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        written = int(process.stdout.readline())
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=PATIENCE)
-    assert errors.splitlines()[-1] == "KeyboardInterrupt"
-    assert "ExceptionGroup" not in errors
-    assert [batch[0].stamp for _, batch in recorded(path)][:written] == list(range(written))
-
-
 async def test_an_existing_file_is_kept(bus: Bus, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
@@ -514,30 +486,6 @@ async def test_after_a_jump_back_of_the_clock_the_times_in_the_file_go_back_too(
     with path.open("rb") as file:
         times = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
     assert times == [9 * SECOND, 5 * SECOND]
-
-
-def test_under_plain_asyncio_a_timeout_leaves_a_whole_file(path: Path) -> None:
-
-    async def record(bus: Bus, started: asyncio.Event) -> None:
-        async with Recorder(bus, path):
-            for sample in noise(5_000):
-                bus.publish(sample)
-            started.set()
-            await asyncio.sleep(PATIENCE)
-
-    async def main() -> None:
-        started = asyncio.Event()
-        with Bus(SimulatedClock()) as bus:
-            task = asyncio.create_task(record(bus, started))
-            await asyncio.wait_for(started.wait(), PATIENCE)
-            task.cancel()
-            # Once more, while it finishes the file.
-            asyncio.get_running_loop().call_soon(task.cancel)
-            with pytest.raises(asyncio.CancelledError):
-                await task
-
-    asyncio.run(main())
-    assert len(recorded(path)) == 5_000
 
 
 def test_a_recorder_that_has_not_begun_has_a_name_and_counts_nothing(tmp_path: Path, path: Path) -> None:

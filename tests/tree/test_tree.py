@@ -178,42 +178,6 @@ def test_a_sample_takes_at_most_100_bytes(insert: Callable[[TransformTree, Any],
     assert {edge.samples for edge in tree.edges()} == {500}
 
 
-@pytest.mark.thorough
-def test_memory_stays_constant_while_samples_are_inserted_and_expire() -> None:
-    tree = TransformTree(keep=1e-6)
-
-    def stream(first: int, last: int) -> None:
-        for stamp in range(first, last):
-            commit_batch(tree, (moving("a", "b", stamp), moving("b", "c", stamp)))
-            if stamp % 100 == 0:
-                tree.lookup("a", "c")
-
-    stream(0, 2_000)
-    with no_growth(200_000):
-        stream(2_000, 40_000)
-    assert [edge.samples for edge in tree.edges()] == [1_001, 1_001]
-
-
-@pytest.mark.thorough
-def test_memory_stays_constant_while_frames_with_new_names_are_added_and_removed() -> None:
-    tree = tree_of(static("map", "base"))
-
-    def churn(first: int, last: int) -> None:
-        for number in range(first, last):
-            frame, parent = f"object {number}", f"support {number}"
-            tree.insert_many([moving("base", parent, number), moving(parent, frame, number)])
-            tree.lookup("map", frame)
-            with pytest.raises(UnknownFrameError):
-                tree.lookup("map", f"misspelt {number}")
-            tree.remove_frame(frame)
-            tree.remove_frame(parent)
-
-    churn(0, 100)
-    with no_growth(50_000):
-        churn(100, 3_000)
-    assert tree.frames() == ["base", "map"]
-
-
 # Threads
 
 

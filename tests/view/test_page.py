@@ -300,17 +300,6 @@ def test_the_fixed_frame_of_trees_of_one_size_is_the_first_by_name_and_the_conne
     assert "3 of 5 frames are connected with 'zoo'" in unescape(texts(Page(tree)).status)
 
 
-def test_a_page_stands_at_the_samples_that_are_in_the_window() -> None:
-    tree = tree_of(moving("map", "a", 0), keep=1.0)
-    tree.insert_many(over("map", "a", (2 * SECOND, 2 * SECOND + 1)))
-    page = Page(tree)
-    stamps = []
-    for forward in (False, False, True, True):
-        page.step(forward)
-        stamps.append(page.timeline.stamp)
-    assert stamps == [2 * SECOND, 2 * SECOND, 2 * SECOND + 1, 2 * SECOND + 1]
-
-
 def test_trails_are_toggled_for_the_selected_frame() -> None:
     page = Page(driven(), trails=["base"])
     page.toggle_trail()

@@ -115,14 +115,6 @@ def test_a_star_in_a_pattern_stands_for_any_letters(pattern: str, robots: list[s
     assert [robot for robot in ("", "a", "ab", "a*b", "axxbxc") if Hearing(pattern, "all").matches(robot)] == robots
 
 
-async def test_many_links_that_open_at_once_all_meet(directory: str) -> None:
-    wires = [LocalWire(DOMAIN, directory=directory) for _ in range(12)]
-    async with AsyncExitStack() as stack:
-        ears = [await stack.enter_async_context(running(wire)) for wire in wires]
-        for ear in ears:
-            await ear.until(lambda ear=ear: len(ear.present()) == len(wires) - 1)  # type: ignore[misc]
-
-
 async def test_links_of_other_domains_do_not_meet(directory: str) -> None:
     other = LocalWire("other", directory=directory)
     async with running(other) as ear, pair(directory):

@@ -377,25 +377,6 @@ anyio.run(main, *sys.argv[1:])
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
-async def test_of_two_linked_routers_one_may_break(fault: signal.Signals, address: str, domain: str) -> None:
-    other = free_address()
-    with start_router(address), start_router(other, address) as second:
-        async with (
-            listening(domain, connect=[address, other]) as one,
-            listening(domain, connect=[other, address]) as two,
-        ):
-            await met(one, two)
-            second.process.send_signal(fault)
-            await until(lambda: Left() in one.of(two))
-            await met(one, two)
-            await talk(one, two)
-            if fault == signal.SIGSTOP:
-                second.process.send_signal(signal.SIGCONT)
-                await talk(one, two)
-
-
-@pytest.mark.thorough
 async def test_a_router_that_is_stopped_holds_nobody_up(address: str, domain: str) -> None:
     dead = free_address()
     with start_router(dead) as stopped:
@@ -453,18 +434,6 @@ async def test_an_opening_that_is_cancelled_at_any_moment_leaves_nothing(address
                 assert scope.cancelled_caught
                 await wire.close()
             await until(lambda: not other.present)
-
-
-@pytest.mark.thorough
-async def test_a_hundred_links_that_open_and_close_leave_nothing(address: str, domain: str) -> None:
-    async with ZenohRouter(address), listening(domain, connect=address) as other:
-        for many in (3, 100):
-            with leaving_nothing():
-                for _ in range(many):
-                    async with listening(domain, connect=address) as one:
-                        await met(one, other)
-                        one.wire.publish(LIVE, b"x")
-                await until(lambda: not other.present)
 
 
 @pytest.mark.thorough

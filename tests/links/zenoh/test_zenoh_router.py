@@ -1,4 +1,3 @@
-import asyncio
 from pathlib import Path
 
 import anyio
@@ -147,20 +146,6 @@ async def test_a_router_whose_opening_is_cancelled_at_any_moment_frees_its_addre
                 await anyio.sleep_forever()
     async with ZenohRouter(address):
         pass
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("anyio_backend", ["asyncio"])
-async def test_a_router_whose_opening_asyncio_cancels_at_any_moment_frees_its_address(address: str) -> None:
-    async def enter() -> None:
-        async with ZenohRouter(address):
-            await anyio.sleep_forever()
-
-    for tenths in range(60):
-        with pytest.raises(TimeoutError):
-            await asyncio.wait_for(enter(), tenths / 10_000)
-        async with ZenohRouter(address):
-            pass
 
 
 async def test_what_makes_no_sense_is_refused_at_once() -> None:

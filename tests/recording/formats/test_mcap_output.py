@@ -4,8 +4,6 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
@@ -15,7 +13,6 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_typestore
 from support.processes import is_open
 from support.samples import moving, static
-from support.strategies import samples
 
 from tfbus import Transform, TransformStamped
 from tfbus.bus.queues import TimedBatch
@@ -84,21 +81,6 @@ def test_a_child_that_changes_its_kind_within_a_batch_has_the_last_one(path: Pat
             ("/tf_static", [moving("map", "b", 0), moving("map", "a", 0)]),
             ("/tf", [moving("map", "b", 2)]),
         ]
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(samples(at=st.integers(-(2**31) * SECOND, 2**31 * SECOND - 1)), min_size=1, max_size=5))
-def test_transforms_come_back_bit_for_bit(tmp_path: Path, batch: list[TransformStamped]) -> None:
-    path = tmp_path / "run.mcap"
-    output = written(path, (5, tuple(batch)))
-    found: dict[str, list[str]] = {"/tf": [], "/tf_static": []}
-    with Reader(path) as reader:
-        for each, _, raw in reader.messages():
-            found[each.topic] += map(repr, decode(raw).samples)
-    # The text tells negative zeros too.
-    assert found["/tf"] == [repr(as_decoded(sample)) for sample in batch if not sample.static]
-    assert found["/tf_static"] == [repr(as_decoded(sample)) for sample in batch if sample.static]
-    assert output.samples == len(batch)
 
 
 def test_an_instant_before_1970_is_recorded_as_1970(path: Path) -> None:
