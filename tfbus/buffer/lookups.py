@@ -11,7 +11,6 @@ timer stays, because the next alarm is nearly always later. A lookup that has wa
 all others that have.
 """
 
-import asyncio
 import logging
 import math
 import sys
@@ -48,42 +47,10 @@ from tfbus.tree.lookup import Bounds, Question, answer
 from tfbus.waiting.live_tree import LiveTree, PendingLookup, Waiter, WaitingIndex, blocking_frames, without_traceback
 
 
-class _OneTurn:
-    """A wait until the next turn of asyncio's loop, as ``asyncio.sleep(0)``, without a coroutine."""
-
-    def __await__(self) -> Generator[Any, None, None]:
-        # A generator would take longer.
-        return cast(Generator[Any, None, None], iter((None,)))
-
-
-_ONE_TURN = _OneTurn()
-
-
-def _running_trio() -> Any:
-    """The module trio if trio runs this task, else None.
-
-    anyio finds out by steps that take longer than an answer. trio has always loaded sniffio, and tells it that it runs:
-    also inside a task of asyncio, as in a notebook, or as the guest of asyncio's loop.
-    """
-    sniffio = sys.modules.get("sniffio")
-    return sys.modules["trio"] if sniffio is not None and sniffio.thread_local.name == "trio" else None
-
-
 def running_loop() -> Any:
     """The running event loop: the loop object of asyncio, or the token of trio."""
     # anyio has no public timer; only the loops' own functions set one without a task of the caller.
-    trio = _running_trio()
-    if trio is not None:
-        return trio.lowlevel.current_trio_token()
-    return asyncio._get_running_loop() or cast(Any, anyio.lowlevel.current_token().native_token)
-
-
-def checkpoint() -> Awaitable[None]:
-    """A checkpoint of the loop that runs now, to be awaited at once."""
-    trio = _running_trio()
-    if trio is not None:
-        return cast(Awaitable[None], trio.lowlevel.checkpoint())
-    return _ONE_TURN if asyncio._get_running_loop() is not None else anyio.lowlevel.checkpoint()
+    return cast(Any, anyio.lowlevel.current_token().native_token)
 
 
 class LoopTimer:
@@ -522,7 +489,7 @@ class Lookups:
         """
         limit = math.inf if timeout is None else as_duration(timeout, "timeout")
         last_reset = self.live.last_reset
-        await checkpoint()
+        await anyio.lowlevel.checkpoint()
         try:
             return self._lookup_since(last_reset, question)
         except MAY_COME as error:
@@ -545,7 +512,7 @@ class Lookups:
                 waiter = self._park(wait)
                 try:
                     # Timeouts of zero give the others a turn as well.
-                    await (checkpoint() if wait.expired else wait.woken)
+                    await (anyio.lowlevel.checkpoint() if wait.expired else wait.woken)
                 except BaseException:
                     waiting.remove(waiter)
                     raise
