@@ -1,5 +1,6 @@
 """Alarms on a loop whose time stands still until the test moves it, and on the loops that there are."""
 
+import asyncio
 import gc
 from contextlib import suppress
 from functools import partial
@@ -349,6 +350,25 @@ async def test_on_the_loop_of_another_thread_a_lookup_has_an_answer_and_does_not
         assert buffer.pending() == ()
         bus.publish(driving("map", "base", 1.0))
         assert (await anyio.to_thread.run_sync(anyio.run, ask)).stamp == SECOND
+
+
+def test_on_trio_inside_a_task_of_asyncio_a_lookup_waits_on_trio() -> None:
+    """As in a cell of a notebook."""
+    trio = pytest.importorskip("trio")
+
+    async def ask() -> None:
+        with Bus() as bus, Buffer(bus) as buffer:
+            async with anyio.create_task_group() as tasks:
+                asked = Asked(tasks, partial(buffer.lookup, "map", "base", SECOND, timeout=60.0))
+                while not buffer.pending():
+                    await anyio.lowlevel.checkpoint()
+                bus.publish(driving("map", "base", 1.0))
+            assert asked.answer.stamp == SECOND
+
+    async def cell() -> None:
+        trio.run(ask)
+
+    asyncio.run(cell())
 
 
 @pytest.mark.parametrize("ends", ["answered", "timed out", "cancelled", "closed"])
