@@ -1,4 +1,4 @@
-"""What waiting costs from the question to the answer, beside events and checkpoints of the same run.
+"""The cost of waiting from the question to the answer, beside events and checkpoints of the same run.
 
 `test_speed.py` measures a wake-up alone. Here a task asks, is parked, is woken by a publish, and takes the answer; then
 it asks again. The turns of the loop and the publisher's checkpoints count on both sides. Times are of the processor.
@@ -32,7 +32,7 @@ AsyncTurn = Callable[[], Awaitable[float]]
 
 
 def on_each_kernel(side: Callable[[Any], Any]) -> dict[str, Any]:
-    """What a side is on the kernel of this process, and on the other one, by the ends of their labels."""
+    """A side on the kernel of this process, and on the other one, by the ends of their labels."""
     return {"": side(tfbus)} | {f" ({name})": side(package) for name, package in other_kernel().items()}
 
 

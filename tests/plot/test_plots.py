@@ -19,7 +19,8 @@ TREE = tree_of(*over("map", "a", (0, 4 * SECOND), speed=1e-9), static("a", "b", 
 
 
 def test_a_path_from_above_has_equal_scales_a_legend_and_marks_of_start_and_end() -> None:
-    [axes] = plot_path(TREE, "map", "a", "b").axes
+    figure = plot_path(TREE, "map", "a", "b")
+    [axes] = figure.axes
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x in map [m]", "y in map [m]")
     assert axes.get_aspect() == 1.0
     paths = [line for line in axes.lines if line.get_linestyle() != "None"]
@@ -28,8 +29,7 @@ def test_a_path_from_above_has_equal_scales_a_legend_and_marks_of_start_and_end(
     assert ends == [[0.0, 4.0], [1.0, 5.0]]
     marks = {line.get_marker(): np.asarray(line.get_xdata()).tolist() for line in axes.lines[4:]}
     assert marks == {"o": [1.0], "s": [5.0]}
-    legend = axes.get_legend()
-    assert legend is not None
+    [legend] = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]
     colours = [line.get_color() for line in axes.lines]
     assert colours == [colours[0]] * 3 + [colours[3]] * 3

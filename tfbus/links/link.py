@@ -335,6 +335,7 @@ class Link:
             await self._end.close()
 
     def _check_loop(self) -> None:
+        self.bus._owner.check_process()
         if not self._received.is_here:
             raise RuntimeError(f"{self!r} was entered in another event loop: make a bus and a link for each event loop")
 

@@ -458,5 +458,6 @@ def plot_path(
         axes.set_zlabel(f"z in {shown(target)} [m]")  # type: ignore[attr-defined]
     axes.set_aspect("equal", adjustable="datalim" if not three_d else "box")
     axes.grid(alpha=0.3)
-    axes.legend()
+    # A place inside of the axes that covers no path takes more than a second to find for a long recording.
+    result.legend(loc="outside lower center", ncols=min(len(drawn), 4))
     return result
