@@ -641,7 +641,7 @@ class Chain:
     up, down : tuple of steps
         From source, and from target, to their common ancestor: moving edges, and one row for each run of static edges.
     alone : bool
-        Whether no other way between the two frames counts at any stamp. Who makes the chain knows it.
+        Whether no other way between the two frames counts at any stamp, as the forest has found out.
 
     Parameters
     ----------
