@@ -30,7 +30,7 @@ class ZenohRouter:
 
     It has no bus, knows no domains, and passes on only what a link behind it, or behind another router, has subscribed
     to. Routers that are connected are as one; each link needs one of them. A router begins anew, and its links connect
-    again, if another one is connected and tells it nothing (see `tfbus.links.zenoh.neighbours`).
+    again, if another one is connected and tells it nothing.
 
     Parameters
     ----------
