@@ -75,7 +75,7 @@ class Table:
             if peer:
                 self.compare(line, mine, name, rounds[-1], goal, unit)
             else:
-                self.add(line, show(mine, unit), f"no {name}")
+                self.add(line, show(mine, unit), name and f"no {name}", "", goal)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_sep("=", "speed")

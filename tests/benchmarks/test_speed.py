@@ -113,6 +113,9 @@ def passes(case: Case, package: Any) -> Pass:
         ("lookup LATEST, 1 edge", Case("lookup latest", "m"), ""),
         ("lookup LATEST, 3 edges", Case("lookup latest", "mmm"), ""),
         ("lookup LATEST, 10 edges", Case("lookup latest", "m" * 10), "<= 0.15"),
+        ("lookup LATEST, 30 edges", Case("lookup latest", "m" * 30), ""),
+        ("lookup LATEST, 1 static edge", Case("lookup latest", "s"), ""),
+        ("lookup LATEST, 30 static edges", Case("lookup latest", "s" * 30), ""),
     ],
 )
 def test_beside_tf2(table: Table, tf2: Ask | None, label: str, case: Case, wanted: str) -> None:
@@ -140,6 +143,131 @@ def test_a_prefix(table: Table, depth: int) -> None:
 
     ours, theirs = take_turns(asking(local, ""), asking(plain, "r/"))
     table.compare(f"lookup with a prefix, depth {depth}", ours, "without", theirs, "<= 1.3", "ns")
+
+
+INSIDE = START + 500 * cases.PERIOD + 333
+BEYOND = START + 10_000 * cases.PERIOD
+Calls = Callable[[Any, Any, str], Callable[[], object]]
+"""Makes a call from the package, a buffer and the last frame of its chain."""
+
+
+def refused(call: Callable[[], object], error: type[Exception]) -> None:
+    try:
+        call()
+    except error:
+        return
+    raise AssertionError("it has an answer")
+
+
+@pytest.mark.parametrize("depth", [1, 3, 10])
+@pytest.mark.parametrize(
+    ("label", "calls", "wanted"),
+    [
+        ("lookup at a stamp", lambda _p, b, f: partial(b.lookup_nowait, BASE, f, INSIDE), ""),
+        ("lookup, max_age", lambda _p, b, f: partial(b.lookup_nowait, BASE, f, max_age=9e8), "<= 3 plain"),
+        ("lookup, not_before", lambda _p, b, f: partial(b.tree.lookup, BASE, f, not_before=START), "<= 3 plain"),
+        (
+            "time travel",
+            lambda _p, b, f: partial(b.lookup_nowait, BASE, f, INSIDE, source_at=START + 10**8, fixed=BASE),
+            "",
+        ),
+        ("lookup, tolerance", lambda _p, b, f: partial(b.lookup_nowait, BASE, f, INSIDE, tolerance=0.1), "<= 8 plain"),
+        ("lookup, max_gap", lambda _p, b, f: partial(b.lookup_nowait, BASE, f, INSIDE, max_gap=1.0), "<= 8 plain"),
+        (
+            "lookup, hold",
+            lambda p, b, f: partial(b.lookup_nowait, BASE, f, INSIDE, extrapolate=p.Hold(1.0)),
+            "<= 8 plain",
+        ),
+        ("can_transform, False", lambda _p, b, f: partial(b.can_transform, BASE, f, BEYOND), "<= 0.5 us"),
+        (
+            "a future lookup, caught",
+            lambda p, b, f: partial(refused, partial(b.lookup_nowait, BASE, f, BEYOND), p.TransformLookupError),
+            "<= 1.9 us",
+        ),
+        (
+            "an unknown frame, caught",
+            lambda p, b, _f: partial(refused, partial(b.lookup_nowait, BASE, "nobody"), p.TransformLookupError),
+            "<= 1.9 us",
+        ),
+    ],
+)
+def test_questions_that_are_not_plain(table: Table, depth: int, label: str, calls: Calls, wanted: str) -> None:
+    def on(package: Any) -> Turn:
+        bus = package.Bus(package.SimulatedClock(START + 1_000 * cases.PERIOD))
+        buffer = package.Buffer(bus, 2 * cases.KEEP)
+        bus.publish(build(cases.history("m" * depth), package))
+        call = calls(package, buffer, last_of("m" * depth))
+        return timed(lambda: [call() for _ in range(HUNDRED)], HUNDRED)
+
+    table.measure(f"{label}, depth {depth}", on, "", None, wanted, "ns")
+
+
+@pytest.mark.parametrize(
+    ("label", "call", "wanted"),
+    [
+        ("a @ b", lambda _p, a, _m: lambda: a @ a, "<= 250"),
+        ("inverse", lambda _p, a, _m: a.inverse, "<= 200"),
+        ("apply, a point", lambda _p, a, _m: partial(a.apply, (1.0, 2.0, 3.0)), "<= 250"),
+        ("matrix", lambda _p, a, _m: a.matrix, "<= 300"),
+        ("from_matrix", lambda p, _a, m: partial(p.Transform.from_matrix, m), "<= 2,000"),
+        ("do_transform, a point", lambda p, a, _m: moved(p, p.PointStamped("f", 0, (1.0, 2.0, 3.0)), a), "<= 1,050"),
+        ("do_transform, a pose", lambda p, a, _m: moved(p, p.PoseStamped("f", 0, a), a), "<= 2,000"),
+    ],
+)
+def test_arithmetic(table: Table, label: str, call: Any, wanted: str) -> None:
+    def on(package: Any) -> Turn:
+        transform = package.Transform((1.0, 2.0, 3.0), Transform.from_axis_angle((1.0, 2.0, 3.0), 0.7).rotation)
+        made = call(package, transform, transform.matrix())
+        return timed(lambda: [made() for _ in range(HUNDRED)], HUNDRED)
+
+    table.measure(label, on, "", None, wanted, "ns")
+
+
+def moved(package: Any, data: Any, transform: Any) -> Callable[[], object]:
+    return partial(package.do_transform, data, package.TransformStamped(BASE, "f", START, transform))
+
+
+@pytest.mark.parametrize(("points", "wanted"), [(100, "<= 2.5"), (1_000, "<= 1.4")])
+def test_clouds(table: Table, points: int, wanted: str) -> None:
+    positions = np.random.default_rng(1).normal(size=(points, 3))
+
+    def on(package: Any) -> Turn:
+        call = moved(package, package.PointCloud("f", 0, positions), package.Transform((1.0, 2.0, 3.0)))
+        return timed(lambda: [call() for _ in range(HUNDRED)], HUNDRED)
+
+    turn, shift = np.eye(3), np.array((1.0, 2.0, 3.0))
+    alone = timed(lambda: [positions @ turn + shift for _ in range(HUNDRED)], HUNDRED)
+    table.measure(f"do_transform, a cloud of {points:,}", on, "numpy", alone, wanted)
+
+
+def test_scan(table: Table) -> None:
+    ranges, angles = np.full(360, 3.0), -3.0 + 0.0166 * np.arange(360)
+
+    def on(package: Any) -> Turn:
+        scan = package.LaserScan("f", 0, ranges, angle_min=-3.0, angle_increment=0.0166)
+        return timed(lambda: [scan.to_points() for _ in range(HUNDRED)], HUNDRED)
+
+    def by_numpy() -> Any:
+        return np.stack((ranges * np.cos(angles), ranges * np.sin(angles), np.zeros(360)), 1)
+
+    alone = timed(lambda: [by_numpy() for _ in range(HUNDRED)], HUNDRED)
+    table.measure("LaserScan.to_points, 360 rays", on, "numpy", alone, "<= 1.6")
+
+
+def test_a_chain_of_ten_thousand_frames(table: Table) -> None:
+    depth, steps = 10_000, count(START + 2)
+    tree = tfbus.TransformTree()
+    names = [f"f{i}" for i in range(depth + 1)]
+    tree.insert_many(TransformStamped(*pair, START + i, Transform()) for i in range(2) for pair in pairwise(names))
+    describing, reparenting = take_turns(
+        timed(tree.describe),
+        timed(
+            lambda: tree.insert(TransformStamped(names[-2 - (stamp := next(steps)) % 2], names[-1], stamp, Transform()))
+        ),
+        rounds=FEW_ROUNDS,
+    )
+    table.add("describe a chain of 10,000 frames", show(describing, "ms"))
+    table.add("reparent the leaf at its end", show(reparenting, "us"), wanted="<= 100 us")
 
 
 ROBOTS, PARTS = 64, 20

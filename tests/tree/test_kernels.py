@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.both_kernels import COMPILED, KERNELS, bits, needs_both, sample_class
+from support.both_kernels import COMPILED, KERNELS, bits, needs_both, sample_class, tfbus_on
 from support.samples import row_of
 from support.strategies import TODAY, transforms
 from transforms3d.quaternions import quat2mat
@@ -276,6 +276,57 @@ def test_the_latest_of_static_edges_is_their_newest_stamp(kernel: Any) -> None:
     assert known.answer("map", "cart", STAMP_MAX).static
     assert known.answer("map", "cart", STAMP_MAX + 1) is None
     assert paths(kernel, cart=kernel.Chain((), (), ())).answer("map", "cart", LATEST) is None
+
+
+OPTIONS = st.fixed_dictionaries(
+    {},
+    optional={
+        "source_at": st.sampled_from([None, LATEST, -5, 5, 15, 25, 2**70]),
+        "fixed": st.sampled_from([None, "map", "arm", "rack", "nobody"]),
+        "not_before": st.sampled_from([None, 0, 20, 21, -(2**63), 2**63]),
+        "not_after": st.sampled_from([None, 19, 20, 2**63]),
+    },
+)
+ROBOT = (
+    *((0, "base", stamp, stamp / 7.0, False) for stamp in (-10, 0, 10, 20, 30)),
+    *((1, "arm", stamp, stamp / 3.0, False) for stamp in (0, 8, 16, 20)),
+    (0, "rack", 3, 5.0, True),
+    (2, "shelf", 4, 0.5, True),
+)
+
+
+def robot(package: Any) -> Any:
+    tree = package.TransformTree()
+    turn = package.Transform.from_axis_angle
+    for parent, child, stamp, metres, static in ROBOT:
+        pose = turn((1.0, 2.0, 3.0), 0.1 + metres, (metres, 0.0, 1.0))
+        tree.insert(package.TransformStamped(("map", "base", "rack")[parent], child, stamp, pose, static=static))
+    return tree
+
+
+def said(package: Any, tree: Any, target: str, source: str, at: Any, options: dict[str, Any]) -> object:
+    """What a lookup answers or raises."""
+    latest = {LATEST: package.LATEST}
+    options = {name: latest.get(value, value) for name, value in options.items()}
+    try:
+        found = tree.lookup(target, source, latest.get(at, at), **options)
+    except (package.TransformError, TypeError, ValueError) as error:
+        return type(error).__name__, str(error)
+    return found.stamp, found.static, bits((*found.transform.translation, *found.transform.rotation))
+
+
+@needs_both
+@given(st.data())
+def test_every_option_has_the_answer_or_the_error_that_the_twin_gives(data: st.DataObject) -> None:
+    trees = {kernel: robot(tfbus_on(kernel)) for kernel in ("python", "compiled")}
+    frames = st.sampled_from(["map", "base", "arm", "rack", "shelf", "nobody"])
+    for _ in range(8):
+        target, source, options = data.draw(frames), data.draw(frames), data.draw(OPTIONS)
+        at = data.draw(st.sampled_from([LATEST, LATEST, -3, 5, 19, 25, 2**63]))
+        # The second time the path is known, and no Python need run.
+        for _ in range(2):
+            ours, theirs = (said(tfbus_on(k), tree, target, source, at, options) for k, tree in trees.items())
+            assert ours == theirs, (target, source, at, options)
 
 
 @needs_both
