@@ -103,7 +103,7 @@ def test_an_empty_recording_plays_nothing(tfbus: Command, tmp_path: Path) -> Non
     path = write_mcap(tmp_path / "empty.mcap", [])
     done, received = play(tfbus, path, "--from", "1", "--to", "2")
     assert (done.returncode, received) == (0, [])
-    assert done.stderr.splitlines()[-1] == "0 samples in 0 messages played in 0.0 s"
+    assert done.stderr.splitlines()[-1].startswith("0 samples in 0 messages played in 0.")
 
 
 @pytest.mark.thorough
