@@ -129,6 +129,7 @@ async def test_what_happens_is_drawn_while_somebody_looks_and_nothing_listens_af
             # Sent a second after its stamp.
             shown.publish(moving("map", "tool", 99 * SECOND, 2.0))
             page.wait("3 of 3 frames", "'tool' is new")
+            anyio.from_thread.run(shown.clock.advance, 4.0)
             page.use("Frame", "tool", "2.000000 0.000000", '<td style="word-break: break-word">1 s</td>')
             assert "'dock' is new" not in page.texts
             # A picture that fails is told, and the next one is drawn.
