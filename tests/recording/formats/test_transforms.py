@@ -107,6 +107,11 @@ def test_a_message_that_is_cut_anywhere_is_malformed(channel: Channel, payload: 
     assert reasons == ({"truncated"} if channel is ROS1 else {"truncated", "encoding", "text"})
 
 
+def test_a_message_in_another_encoding_is_told_by_its_header() -> None:
+    with pytest.raises(MalformedMessageError, match=r"its header is 00 07 00 00$"):
+        parser_of(CDR)(b"\0\7\0\0\1\2\3\4")
+
+
 @pytest.mark.parametrize(
     ("write", "channel", "low", "high"),
     [
