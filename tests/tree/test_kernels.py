@@ -305,7 +305,7 @@ def robot(package: Any) -> Any:
 
 
 def said(package: Any, tree: Any, target: str, source: str, at: Any, options: dict[str, Any]) -> object:
-    """What a lookup answers or raises."""
+    """The answer of a lookup, or its error."""
     latest = {LATEST: package.LATEST}
     options = {name: latest.get(value, value) for name, value in options.items()}
     try:
