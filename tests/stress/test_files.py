@@ -117,7 +117,8 @@ def test_a_damaged_file_is_read_or_refused_and_nothing_else(tmp_path: Path, kind
                 list(opened.messages(5, 20))
             convert([recording], tmp_path / "copy.mcap", overwrite=True)
         except RecordingError as error:
-            assert error.reason in ("truncated", "damaged", "empty", "foreign")
+            # The damaged list of a folder may name a file that is not there.
+            assert error.reason in ("truncated", "damaged", "empty", "foreign", "missing")
 
 
 def record(opcode: int, data: bytes) -> bytes:
