@@ -125,20 +125,18 @@ class Poll:
 
     def ready(self) -> list[tuple[Any, bool, bool]]:
         """The owners of the sockets that are ready, with whether there are bytes to read, and room to write."""
-        return [(key.data, bool(events & EVENT_READ), bool(events & EVENT_WRITE)) for key, events in self._select()]
+        found = self._selector.select(0.0) if self._selector.get_map() else []
+        return [(key.data, bool(events & EVENT_READ), bool(events & EVENT_WRITE)) for key, events in found]
 
-    def _select(self) -> list[tuple[selectors.SelectorKey, int]]:
-        return self._selector.select(0.0) if self._selector.get_map() else []
-
-    async def wait(self) -> None:
-        """Wait until a socket may be ready."""
+    async def wait(self) -> list[tuple[Any, bool, bool]]:
+        """Wait until a socket may be ready; returns as `ready`."""
         if self._loop is not None:
             self._ready = self._loop.create_future()
-            await self._ready
-            return
+            found: list[tuple[Any, bool, bool]] = await self._ready
+            return found
         if self._file is not None:
             await anyio.wait_readable(self._file)
-            return
+            return self.ready()
         self._changed = anyio.Event()
         async with anyio.create_task_group() as tasks:
 
@@ -156,11 +154,12 @@ class Poll:
                     tasks.start_soon(watch, lambda sock=key.fileobj: anyio.wait_readable(sock))
                 if key.events & EVENT_WRITE:
                     tasks.start_soon(watch, lambda sock=key.fileobj: anyio.wait_writable(sock))
+        return self.ready()
 
     def _wake(self) -> None:
         # The loop may have seen the file before the task has read all.
-        if self._ready is not None and not self._ready.done() and self._select():
-            self._ready.set_result(None)
+        if self._ready is not None and not self._ready.done() and (found := self.ready()):
+            self._ready.set_result(found)
 
     def close(self) -> None:
         """Stop waiting, and close the file."""

@@ -166,8 +166,7 @@ class LocalWire(Wire):
                 connection.stop_reading()
             with anyio.move_on_after(_FLUSH_TIME, shield=True):
                 while any(connection.waits for connection in self._links.values()):
-                    await self._poll.wait()
-                    for connection, _, _ in self._poll.ready():
+                    for connection, _, _ in await self._poll.wait():
                         connection.flush()
                         connection.stop_reading()
         finally:
@@ -301,9 +300,9 @@ class LocalWire(Wire):
         """Read all connections, and write the frames that wait for room."""
         budget = TurnBudget()
         while True:
-            await self._poll.wait()
+            ready = await self._poll.wait()
             budget.begin()
-            for connection, readable, writable in self._poll.ready():
+            for connection, readable, writable in ready:
                 if connection is None:
                     await self._accept(budget)
                 else:
