@@ -28,6 +28,8 @@ PATIENCE: Final = 2.0, 5.0
 """s; so long a router may be connected without its token; drawn at random, so that not both begin anew at once."""
 PERIOD: Final = 1.0
 """s between two looks at the connected routers."""
+PAUSE_TO_LISTEN: Final = 0.05
+"""s between two attempts to open another session, while the address of the one before is not free yet."""
 MOST_ROUTERS: Final = 10_000
 """So many tokens are remembered."""
 _MARK: Final = b"tfbus".hex()

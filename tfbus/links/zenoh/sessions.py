@@ -258,7 +258,7 @@ class Keeper:
     Parameters
     ----------
     keep : callable
-        The work of the thread. It returns soon after `stopped`; it waits for `changed` meanwhile.
+        The work of the thread. It returns soon after `stopped`; it calls `wait` meanwhile.
 
     Attributes
     ----------
@@ -277,6 +277,11 @@ class Keeper:
         use_zenoh()
         atexit.register(self.stop)
         self._thread.start()
+
+    def wait(self, seconds: float | None = None) -> None:
+        """Wait for the next change, for so long at most; for the thread."""
+        self.changed.wait(seconds)
+        self.changed.clear()
 
     def stop(self) -> None:
         """Have the thread end; from any thread."""

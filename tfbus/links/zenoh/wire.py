@@ -46,7 +46,7 @@ import zenoh
 
 from tfbus._aio.loops import LoopWaker
 from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
-from tfbus.links.zenoh.neighbours import PERIOD, Neighbours, open_router
+from tfbus.links.zenoh.neighbours import PAUSE_TO_LISTEN, PERIOD, Neighbours, open_router
 from tfbus.links.zenoh.sessions import (
     LONGEST_NAME,
     Addresses,
@@ -70,8 +70,6 @@ SETTLED: Final = 1.0
 """s after which a router has told a new publisher who subscribes to it."""
 PAUSE: Final = (0.2, 0.6)
 """s between two attempts to reach any router; drawn at random, because a router that starts again has many clients."""
-PAUSE_TO_LISTEN: Final = 0.05
-"""s between two attempts to listen again."""
 NO_ROBOT: Final = "~"
 
 _NAME = re.compile(r"[\w.-]+", re.ASCII)
@@ -204,8 +202,7 @@ class ZenohWire(Wire):
         while (session := self._connect(channels)) is not None:
             self._wake()
             while not (self._keeper.stopped or session.is_broken(monotonic())):
-                self._keeper.changed.wait(session.period)
-                self._keeper.changed.clear()
+                self._keeper.wait(session.period)
             self._session = None
             channels = session.channels
             if self._keeper.stopped:
@@ -230,8 +227,7 @@ class ZenohWire(Wire):
             if self._is_router:
                 # The session before may not have freed the address yet.
                 if self._has_listened:
-                    self._keeper.changed.wait(PAUSE_TO_LISTEN)
-                    self._keeper.changed.clear()
+                    self._keeper.wait(PAUSE_TO_LISTEN)
                     continue
                 self._failure = failure
             elif since is not None and monotonic() > since + FIRST_WAIT:
@@ -243,8 +239,7 @@ class ZenohWire(Wire):
             self._wake()
             if self._is_router:
                 return None
-            self._keeper.changed.wait(uniform(*PAUSE))
-            self._keeper.changed.clear()
+            self._keeper.wait(uniform(*PAUSE))
 
     def _connect_once(self, channels: Iterable[str]) -> "_Session":
         self._number += 1

@@ -8,7 +8,7 @@ from typing import Final, Self
 import anyio
 import anyio.to_thread
 
-from tfbus.links.zenoh.neighbours import PERIOD, Neighbours, open_router
+from tfbus.links.zenoh.neighbours import PAUSE_TO_LISTEN, PERIOD, Neighbours, open_router
 from tfbus.links.zenoh.sessions import (
     Addresses,
     Keeper,
@@ -21,8 +21,6 @@ from tfbus.registration import warn_unless_entered
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
 """The address of a router that is given none: only processes of this machine reach it."""
-PAUSE: Final = 0.05
-"""s between two attempts to listen again."""
 
 
 class ZenohRouter:
@@ -102,14 +100,12 @@ class ZenohRouter:
                     self._failure = error
                     return
                 # The session before may not have freed the address yet.
-                keeper.changed.wait(PAUSE)
-                keeper.changed.clear()
+                keeper.wait(PAUSE_TO_LISTEN)
                 continue
             finally:
                 self._opened.set()
             while not (keeper.stopped or router.are_silent(monotonic())):
-                keeper.changed.wait(PERIOD)
-                keeper.changed.clear()
+                keeper.wait(PERIOD)
             if keeper.stopped:
                 close_session(router)
             else:
