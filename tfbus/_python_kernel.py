@@ -749,12 +749,17 @@ class Paths:
     def version(self, version: int) -> None:
         self._changes = version - self.inserted
 
+    def _chain(self, target: str, source: str) -> Chain | None:
+        """The chain of `recent` between two frames, if it has edges."""
+        by_source = self.recent.get(target)
+        chain = None if by_source is None else by_source.get(source)
+        return chain if chain is not None and (chain.up or chain.down) else None
+
     def answer(self, target: str, source: str, at: object) -> Any:
         """The answer of a lookup, if it needs nothing but a path of `recent` that covers the stamp; else None."""
         with self._lock:
-            by_source = self.recent.get(target)
-            chain = None if by_source is None else by_source.get(source)
-            if chain is None or not (chain.up or chain.down):
+            chain = self._chain(target, source)
+            if chain is None:
                 return None
             stamp = chain.latest() if at is self._latest else at
             if type(stamp) is not int or not (chain._edges or STAMP_MIN <= stamp <= STAMP_MAX):
@@ -770,9 +775,8 @@ class Paths:
     def can_answer(self, target: str, source: str, at: object) -> bool | None:
         """Whether a lookup has an answer, if a path of `recent` tells; else None."""
         with self._lock:
-            by_source = self.recent.get(target)
-            chain = None if by_source is None else by_source.get(source)
-            if chain is None or not (chain.up or chain.down):
+            chain = self._chain(target, source)
+            if chain is None:
                 return None
             stamp = chain.latest() if at is self._latest else at
             if stamp is None and at is not None:

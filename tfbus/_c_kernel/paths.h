@@ -1052,20 +1052,29 @@ method_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
     return OBJECT(self);
 }
 
-/* The plain answer for source in target; None if there is none. Without stamps it is the latest. */
-static PyObject *
-method_answer(const Method *self, PyObject *asker, PyObject *target, PyObject *source, PyObject *at)
+/* The paths of the object that is asked, a new reference; NULL without an error if it has none. */
+static Paths *
+paths_of(PyObject *asker)
 {
     PyObject *paths = PyObject_GetAttr(asker, paths_string);
     if (paths == NULL || !PyObject_TypeCheck(paths, PathsType)) {
         PyErr_Clear();
-        Py_XDECREF(paths);
+        Py_CLEAR(paths);
+    }
+    return (Paths *)paths;
+}
+
+/* The plain answer for source in target; None if there is none. Without stamps it is the latest. */
+static PyObject *
+method_answer(const Method *self, PyObject *asker, PyObject *target, PyObject *source, PyObject *at)
+{
+    Paths *paths = paths_of(asker);
+    if (paths == NULL) {
         Py_RETURN_NONE;
     }
-    PyObject *question[3] = {target, source, at == NULL ? ((Paths *)paths)->latest : at};
-    PyObject *found = self->many == NULL ? paths_answer((Paths *)paths, question, 3)
-                                         : paths_answer_many((Paths *)paths, question, 3);
-    Py_DECREF(paths);
+    PyObject *question[3] = {target, source, at == NULL ? paths->latest : at};
+    PyObject *found = self->many == NULL ? paths_answer(paths, question, 3) : paths_answer_many(paths, question, 3);
+    Py_DECREF(OBJECT(paths));
     if (self->many == NULL || found == NULL || found == Py_None) {
         return found;
     }
@@ -1165,13 +1174,10 @@ method_answer_with(const Method *self, PyObject *const *args, PyObject *at, PyOb
     PyObject *source_at = Py_None, *fixed = Py_None;
     Bounds bounds = {INT64_MIN, INT64_MAX};
     int plain = 1, bounded = 0;
-    PyObject *found = PyObject_GetAttr(args[0], paths_string);
-    if (found == NULL || !PyObject_TypeCheck(found, PathsType)) {
-        PyErr_Clear();
-        Py_XDECREF(found);
+    Paths *paths = paths_of(args[0]);
+    if (paths == NULL) {
         Py_RETURN_NONE;
     }
-    Paths *paths = (Paths *)found;
     for (Py_ssize_t i = first; plain && i < PyTuple_Size(names); i++) {
         PyObject *name = PyTuple_GetItem(names, i);
         PyObject *by_default = PyDict_CheckExact(self->defaults) ? PyDict_GetItem(self->defaults, name) : NULL;
@@ -1207,7 +1213,7 @@ method_answer_with(const Method *self, PyObject *const *args, PyObject *at, PyOb
             Py_INCREF(answer);
         }
     }
-    Py_DECREF(found);
+    Py_DECREF(OBJECT(paths));
     return answer;
 }
 

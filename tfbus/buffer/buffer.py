@@ -1,6 +1,5 @@
 """The buffer: a tree that a bus fills, and lookups that wait for missing transforms."""
 
-import time
 from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Any, SupportsIndex, TypeVar
@@ -10,7 +9,6 @@ import anyio.lowlevel
 from tfbus.buffer.lookups import LocalNames, Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
-from tfbus.clock import SystemClock
 from tfbus.data import Stamped, do_transform
 from tfbus.errors import ExtrapolationError, TransformLookupError
 from tfbus.frames import as_prefix, is_frame
@@ -108,8 +106,7 @@ class Buffer:
             bus._check_thread()
             self._forest = forest_of(tree).copy_within(window)
         self._paths = self._forest.paths if named is None else self._forest.local_paths
-        # A class derived from the clock may tell the time in another way.
-        self._paths.now = time.time_ns if type(bus.clock) is SystemClock else bus.clock.now
+        self._paths.now = bus.clock.now
         self._tree = tree_of(self._forest, keep, bus.max_translation)
         self._live = LiveTree(self._forest, bus._announce_past_loop)
         self._lookups = Lookups(self._live, bus, self._local_names)

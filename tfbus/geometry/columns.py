@@ -13,7 +13,8 @@ import numpy.typing as npt
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import Batch, TransformStamped, is_within, not_physical
 from tfbus.geometry.transform import Transform
-from tfbus.stamps import StampLike, StampsLike, as_array, as_stamp, as_stamps
+from tfbus.geometry.transform_array import as_columns
+from tfbus.stamps import StampLike, StampsLike, as_stamp, as_stamps
 from tfbus.which_kernel import columns
 
 Names: TypeAlias = str | Sequence[str] | npt.NDArray[Any]
@@ -62,13 +63,7 @@ class SampleColumns:
         static: bool,
         max_translation: float,
     ) -> None:
-        moves = as_array(translations, "translations", np.float64)
-        turns = as_array(rotations, "rotations", np.float64)
-        if moves.ndim != 2 or moves.shape[1] != 3 or turns.shape != (len(moves), 4):
-            raise InvalidTransformError(
-                f"translations and rotations must have shapes (n, 3) and (n, 4), got {moves.shape} and {turns.shape}",
-                reason="wrong length",
-            )
+        moves, turns = as_columns(translations, rotations)
         if not isinstance(authority, str):
             raise TypeError(f"authority must be a str, not {authority!r}")
         count = len(moves)

@@ -46,6 +46,18 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 
+def as_columns(translations: npt.ArrayLike, rotations: npt.ArrayLike) -> tuple[Floats, Floats]:
+    """Translations of shape (n, 3) and rotations (n, 4); raises `InvalidTransformError` for other shapes."""
+    moves = as_array(translations, "translations", np.float64)
+    turns = as_array(rotations, "rotations", np.float64)
+    if moves.ndim != 2 or moves.shape[1] != 3 or turns.shape != (len(moves), 4):
+        raise InvalidTransformError(
+            f"translations and rotations must have shapes (n, 3) and (n, 4), got {moves.shape} and {turns.shape}",
+            reason="wrong length",
+        )
+    return moves, turns
+
+
 class TransformArray:
     """A sequence of transforms in arrays, such as one frame's at many stamps. Immutable.
 
@@ -84,13 +96,7 @@ class TransformArray:
     _memory: bytes
 
     def __init__(self, translations: npt.ArrayLike, rotations: npt.ArrayLike, stamps: StampsLike | None = None) -> None:
-        moves = as_array(translations, "translations", np.float64)
-        turns = as_array(rotations, "rotations", np.float64)
-        if moves.ndim != 2 or moves.shape[1] != 3 or turns.shape != (len(moves), 4):
-            raise InvalidTransformError(
-                f"translations and rotations must have shapes (n, 3) and (n, 4), got {moves.shape} and {turns.shape}",
-                reason="wrong length",
-            )
+        moves, turns = as_columns(translations, rotations)
         with np.errstate(over="ignore"):
             squares = np.square(turns).sum(axis=1)
         norms = np.sqrt(squares)
