@@ -76,9 +76,10 @@ def test_three_processes_have_every_sample_once(processes: Crowd, place: Place) 
     send_in_turn(members)
     for member in members:
         (link,) = member.ask("facts")["links"]
-        # All of them hear each other directly, so none passes anything on.
+        # All of them hear each other directly, so none passes on what it receives. It may send a little more than its
+        # own samples: until a router has said who listens, a link also sends to those that hear it slowly.
         assert link["duplicates"] == 0
-        assert link["sent_samples"] == link["received_samples"] / 2
+        assert link["sent_samples"] < link["received_samples"]
 
 
 @thorough

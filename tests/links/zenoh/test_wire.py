@@ -261,17 +261,15 @@ async def test_links_of_two_linked_routers_meet_and_go_to_the_other_one_when_the
 
 
 async def test_a_link_that_listens_is_the_router_of_the_others(address: str, domain: str) -> None:
-    async with (
-        listening(domain, "base", listen=address) as base,
-        listening(domain, connect=address) as one,
-        listening(domain, connect=address) as two,
-    ):
-        await met(base, one, two)
-        await talk(base, one, two)
-        assert one.present[base.id] == "base"
-        # It hears only what it means to hear, though all goes through it.
-        two.wire.send(one.id, b"private")
-        await until(lambda: (two.id, b"private") in one.messages)
+    async with listening(domain, "base", listen=address) as base:
+        async with listening(domain, connect=address) as one, listening(domain, connect=address) as two:
+            await met(base, one, two)
+            await talk(base, one, two)
+            assert one.present[base.id] == "base"
+            # It hears only what it means to hear, though all goes through it.
+            two.wire.send(one.id, b"private")
+            await until(lambda: (two.id, b"private") in one.messages)
+        await until(lambda: base.present == {})
     assert (two.id, b"private") not in base.messages
     assert len(base.of(two)) == base.of(two).index(Left()) + 1
 

@@ -14,9 +14,10 @@ tells it nothing (see `tfbus.links.zenoh.neighbours`).
 
 Present: a link is present while the token of its newest known session is seen. A new session of a present link is told
 as `Left` and `Joined`, because messages may have been lost between them. The token of an older session means nothing
-any more, whenever it goes. When the own session breaks, all links have left, and join again by the next one. A router
-notices by end of file that a process has died, and by silence for a lease that it is cut off or stopped; a link notices
-the same of its router, by the lease that the router announces.
+any more, whenever it goes. The end of a token may overtake messages, because zenoh sends declarations first: a link has
+left when its token has gone and no message of it has come for `LAST_WORDS`. When the own session breaks, all links have
+left, and join again by the next one. A router notices by end of file that a process has died, and by silence for a
+lease that it is cut off or stopped; a link notices the same of its router, by the lease that the router announces.
 
 Bounds: a message has at most `MAX_MESSAGE` bytes; `UNSENT` buffers of 64 KiB wait for the router, what finds no room is
 dropped, and no call waits for room longer than zenoh's 50 ms, once each time that the network becomes congested;
@@ -68,6 +69,8 @@ FIRST_WAIT: Final = 1.0
 """s; `ZenohWire.open` waits so long for a router."""
 SETTLED: Final = 1.0
 """s after which a router has told a new publisher who subscribes to it."""
+LAST_WORDS: Final = 0.1
+"""s without a message after which a link whose token has gone has left."""
 PAUSE: Final = (0.2, 0.6)
 """s between two attempts to reach any router; drawn at random, because a router that starts again has many clients."""
 NO_ROBOT: Final = "~"
@@ -201,8 +204,8 @@ class ZenohWire(Wire):
         channels: list[str] = []
         while (session := self._connect(channels)) is not None:
             self._wake()
-            while not (self._keeper.stopped or session.is_broken(monotonic())):
-                self._keeper.wait(session.period)
+            while not (self._keeper.stopped or session.is_broken(now := monotonic())):
+                self._keeper.wait(session.let_leave(now))
             self._session = None
             channels = session.channels
             if self._keeper.stopped:
@@ -289,10 +292,10 @@ class _Session:
         """Whether another session is needed."""
         return self.hearer.broken or (self._neighbours is not None and self._neighbours.are_silent(now))
 
-    @property
-    def period(self) -> float | None:
-        """The time in s after which `is_broken` is to be called again; None if not before a change."""
-        return None if self._neighbours is None else PERIOD
+    def let_leave(self, now: float) -> float | None:
+        """Tell of links that have left; returns the s until the next look at the session, None if a change is first."""
+        left = self.hearer.let_leave(now)
+        return left if self._neighbours is None else min(PERIOD, PERIOD if left is None else left)
 
     def begin(self, domain: str, number: int, hears: Sequence[Hearing], *, is_router: bool) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
@@ -380,12 +383,16 @@ class _Hearer:
         self._ended = False
         # The number of the newest session of each link that is present, and which of `hears` is for it.
         self._present: dict[str, tuple[int, int]] = {}
+        # When each link that is present without a token has left.
+        self._leaving: dict[str, float] = {}
 
     def take_published(self, index: int, sample: zenoh.Sample) -> None:
         link = str(sample.key_expr).rpartition("/")[2]
         with self._lock:
             known = self._present.get(link)
             if known is not None and known[1] == index:
+                if link in self._leaving:
+                    self._leaving[link] = monotonic() + LAST_WORDS
                 self._receive(link, _content(sample))
 
     def take_sent(self, sample: zenoh.Sample) -> None:
@@ -411,15 +418,24 @@ class _Hearer:
             known = self._present.get(link)
             if sample.kind == zenoh.SampleKind.DELETE:
                 if known is not None and known[0] == number:
-                    del self._present[link]
-                    self._receive(link, Left())
-            elif self._ended or (known[0] >= number if known is not None else len(self._present) >= MAX_LINKS):
+                    self._leaving[link] = monotonic() + LAST_WORDS
+                    self._changed.set()
                 return
+            if known is None:
+                is_news = len(self._present) < MAX_LINKS
             else:
-                if known is not None:
-                    self._receive(link, Left())
+                is_news = number > known[0] or (number == known[0] and link in self._leaving)
+            if is_news and not self._ended:
+                self._leave(link)
                 self._present[link] = number, index
                 self._receive(link, Joined(robot))
+
+    def let_leave(self, now: float) -> float | None:
+        """Tell of the links that have left by now; returns the s until the next one has, None if no link is leaving."""
+        with self._lock:
+            for link in [link for link, due in self._leaving.items() if due <= now]:
+                self._leave(link)
+            return min(self._leaving.values()) - now if self._leaving else None
 
     def take_event(self, event: zenoh.TransportEvent) -> None:
         if event.kind == zenoh.SampleKind.DELETE:
@@ -430,9 +446,13 @@ class _Hearer:
         """Have all links leave, and take nothing any more; in any thread."""
         with self._lock:
             self._ended = True
-            for link in self._present:
-                self._receive(link, Left())
-            self._present.clear()
+            for link in list(self._present):
+                self._leave(link)
+
+    def _leave(self, link: str) -> None:
+        if self._present.pop(link, None) is not None:
+            self._leaving.pop(link, None)
+            self._receive(link, Left())
 
 
 def _directly(callback: Callable[[Any], object]) -> Any:
