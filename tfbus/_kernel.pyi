@@ -3,7 +3,7 @@
 `Feed`, `Intake` and `Method` have no twin: without the compiled kernel the ordinary way runs; see `tfbus.which_kernel`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 Vector = tuple[float, float, float]
@@ -108,8 +108,10 @@ class Judge:
 class Parked:
     answer: Any
     elsewhere: bool
+    limit: Any
+    names: tuple[str, ...] | None
     place: Any
-    plain: tuple[str, str, Any] | None
+    question: Any
     version: int
     wake: Any
 
@@ -135,6 +137,7 @@ class Feed:
         /,
     ) -> None: ...
     def insert(self, batch: tuple[Sample, ...], /) -> bool: ...
+    def park(self, waiter: Parked, orders: Iterator[int], passed: int, /) -> bool: ...
 
 class Intake:
     feeds: tuple[tuple[Any, Any], ...]

@@ -7,17 +7,93 @@ counts the calls of that method. If there was no call between two turns of the s
 scheduled earlier has run, and nothing is left to run.
 """
 
+import asyncio
 import logging
+import sys
 import threading
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import Context, copy_context
+from functools import partial
 from time import monotonic
+from types import SimpleNamespace, coroutine
 from typing import Any, cast
 
 import anyio
 import anyio.lowlevel
 import anyio.to_thread
+
+# trio writes its name here while it runs a task, also inside a task of asyncio, as in a cell of a notebook. It needs
+# sniffio, which anyio has imported if it is installed.
+_here: Any = getattr(sys.modules.get("sniffio"), "thread_local", SimpleNamespace(name=None))
+
+
+@coroutine
+def _turn() -> Generator[None, None, None]:
+    yield
+
+
+def checkpoint() -> Awaitable[None]:
+    """`anyio.lowlevel.checkpoint`, without the way through anyio: asyncio takes a bare yield as a turn of the loop."""
+    return _turn() if _here.name is None else _trio().lowlevel.checkpoint()
+
+
+def running_loop() -> Any:
+    """The running event loop: the loop object of asyncio, or the token of trio."""
+    return asyncio.get_running_loop() if _here.name is None else _trio().lowlevel.current_trio_token()
+
+
+def _trio() -> Any:
+    return sys.modules["trio"]
+
+
+def wake_up(loop: Any) -> tuple[Awaitable[None], Callable[[], object]]:
+    """A wait of one task on the running loop, to be awaited once, and the function that ends it.
+
+    If it was ended before the task awaits it, there is no checkpoint. The function may raise an `Exception` if the wait
+    has ended, or the event loop is closed.
+    """
+    if _here.name is None:
+        # No function of Python is then on the way from a publish to the event loop.
+        future = loop.create_future()
+        return future, partial(future.set_result, None)
+    woken = _TrioWakeUp()
+    return woken, woken.end
+
+
+class _TrioWakeUp:
+    """A wait of one task on trio."""
+
+    __slots__ = ("_ended", "_task")
+
+    def __init__(self) -> None:
+        self._task: Any = None
+        self._ended = False
+
+    def end(self) -> None:
+        """End the wait, if it has not ended."""
+        if not self._ended:
+            self._ended = True
+            task, self._task = self._task, None
+            if task is not None:
+                _trio().lowlevel.reschedule(task)
+
+    def __await__(self) -> Generator[Any, None, None]:
+        if self._ended:
+            return _turnless()
+        lowlevel = _trio().lowlevel
+        self._task = lowlevel.current_task()
+        return cast(Generator[Any, None, None], lowlevel.wait_task_rescheduled(self._abort).__await__())
+
+    def _abort(self, _raise_cancel: object) -> Any:
+        """End the wait, because trio has cancelled it."""
+        self._task = None
+        self._ended = True
+        return _trio().lowlevel.Abort.SUCCEEDED
+
+
+def _turnless() -> Generator[Any, None, None]:
+    yield from ()
 
 
 class LoopWaker:

@@ -1,10 +1,13 @@
 /* Waiting: the lookups that are parked until a sample comes, and the insertion that wakes them.
  *
  * A Parked is one waiting lookup. A Line is the lookups under one frame; its `places` are sorted so that the next one due
- * is the last. A Feed is the way of plain batches into one buffer: it stores the batch, pops from the lines of its frames
- * whoever is due, and calls `wake` with the answer already found, if that is plain. It takes a batch only if the lines
- * need nothing else: nobody waits for any sample, no limit is passed, and nobody watches the frames. Else it does
- * nothing, and Python inserts and wakes.
+ * is the last. A Feed is the plain way into and out of the waiting lookups of one buffer.
+ *
+ * `park` puts a lookup in the line of the edge that lags most, if newer samples are all that it lacks. It makes no error,
+ * which says the same in words and takes many times as long: Python words it when somebody asks what blocks the lookup.
+ * `insert` stores a batch, pops from the lines of its frames whoever is due, and calls `wake` with the answer already
+ * found, if that is plain. It takes a batch only if the lines need nothing else: nobody waits for any sample, no limit is
+ * passed, and nobody watches the frames. Where one of the two does nothing, Python parks, or inserts and wakes.
  *
  * Calling `wake` runs Python code, which may change everything here. So a waiter leaves its line before it is called,
  * and nothing is remembered across the call but references of our own.
@@ -14,23 +17,27 @@
 
 typedef struct {
     PyObject_HEAD
-    PyObject *plain;   /* target, source and at of a plain question; None of another */
-    PyObject *wake;    /* called without arguments, once */
-    PyObject *place;   /* its place in a line, if it has one */
-    PyObject *answer;  /* the answer of the insertion that woke it */
-    long long version; /* of the paths, when they had this answer */
-    char elsewhere;    /* whether it is noted elsewhere than in a line and among all parked lookups */
+    PyObject *question; /* a tuple: target, source, at, and options that are all None if it is plain */
+    PyObject *wake;     /* called without arguments, once */
+    PyObject *place;    /* its place in a line, if it has one */
+    PyObject *answer;   /* the answer of the insertion that woke it */
+    PyObject *names;    /* the frames that block it, a tuple */
+    PyObject *limit;    /* its place among the first limits, if it has one */
+    long long version;  /* of the paths, when they had this answer */
+    char elsewhere;     /* whether Python has noted it elsewhere, and has to forget it */
 } Parked;
 
-REFERENCES(parked, 4)
+REFERENCES(parked, 6)
 
 static PyMemberDef parked_members[] = {
-    {"plain", T_OBJECT, offsetof(Parked, plain), 0, PyDoc_STR("Target, source and at of a plain question, or None.")},
+    {"question", T_OBJECT, offsetof(Parked, question), 0, PyDoc_STR("Target, source, at, and the options.")},
     {"wake", T_OBJECT, offsetof(Parked, wake), 0, PyDoc_STR("Called once, after it was taken out of its line.")},
     {"place", T_OBJECT, offsetof(Parked, place), 0, PyDoc_STR("Its place in a line, or None.")},
     {"answer", T_OBJECT, offsetof(Parked, answer), 0, PyDoc_STR("The answer of the insertion that woke it, or None.")},
+    {"names", T_OBJECT, offsetof(Parked, names), 0, PyDoc_STR("The frames that block it.")},
+    {"limit", T_OBJECT, offsetof(Parked, limit), 0, PyDoc_STR("Its place among the first limits, or None.")},
     {"version", T_LONGLONG, offsetof(Parked, version), 0, PyDoc_STR("The version of the paths that gave this answer.")},
-    {"elsewhere", T_BOOL, offsetof(Parked, elsewhere), 0, PyDoc_STR("Whether more than its line has to forget it.")},
+    {"elsewhere", T_BOOL, offsetof(Parked, elsewhere), 0, PyDoc_STR("Whether Python has to forget it.")},
     {NULL}
 };
 
@@ -147,6 +154,185 @@ is_reached(PyObject *place, int64_t stamp)
     return overflow > 0 || (overflow == 0 && (stamp != INT64_MIN && negative >= -stamp));
 }
 
+/* Target, source and at of a waiter's plain question, borrowed; 0 if it is not plain. */
+static int
+is_plain(const Parked *waiter, PyObject **asked)
+{
+    PyObject *question = waiter->question;
+    const Py_ssize_t size = question != NULL && PyTuple_Check(question) ? PyTuple_Size(question) : 0;
+    for (Py_ssize_t i = 0; i < size; i++) {
+        PyObject *item = PyTuple_GetItem(question, i);
+        if (i < 3) {
+            asked[i] = item;
+        } else if (item != Py_None) {
+            return 0;
+        }
+    }
+    return size >= 3;
+}
+
+/* The index of the first place in a sorted list that is not less than `place`; -1 for an error. */
+static Py_ssize_t
+place_index(PyObject *places, PyObject *place)
+{
+    Py_ssize_t low = 0, high = PyList_Size(places);
+    while (low < high) {
+        const Py_ssize_t middle = (low + high) / 2;
+        const int less = PyObject_RichCompareBool(PyList_GetItem(places, middle), place, Py_LT);
+        if (less < 0) {
+            return -1;
+        }
+        low = less ? middle + 1 : low;
+        high = less ? high : middle;
+    }
+    return low;
+}
+
+/* Put (-stamp, -order, waiter) into a sorted list, and into `place`. */
+static int
+line_up(PyObject *places, PyObject **place, Parked *waiter, int64_t stamp, PyObject *orders)
+{
+    PyObject *order = PyIter_Next(orders);
+    const long long number = order == NULL ? -1 : PyLong_AsLongLong(order);
+    Py_XDECREF(order);
+    if (number < 0) {
+        if (!PyErr_Occurred()) {
+            PyErr_SetString(PyExc_ValueError, "the orders end, or are negative");
+        }
+        return -1;
+    }
+    PyObject *made = Py_BuildValue("(LLO)", (long long)-stamp, -number, OBJECT(waiter));
+    const Py_ssize_t index = made == NULL ? -1 : place_index(places, made);
+    if (index < 0 || PyList_Insert(places, index, made) < 0) {
+        Py_XDECREF(made);
+        return -1;
+    }
+    PyObject *old = *place;
+    *place = made;
+    Py_XDECREF(old);
+    return 0;
+}
+
+/* Forget the limit of a waiter, if it has one. */
+static int
+drop_limit(PyObject *limits, Parked *waiter)
+{
+    PyObject *limit = waiter->limit;
+    if (limit == NULL || !PyTuple_CheckExact(limit)) {
+        return 0;
+    }
+    waiter->limit = NULL;
+    const Py_ssize_t index = place_index(limits, limit);
+    const int failed = index < 0 || (index < PyList_Size(limits) && PyList_GetItem(limits, index) == limit
+                                     && PyList_SetSlice(limits, index, index + 1, NULL) < 0);
+    Py_DECREF(limit);
+    return failed ? -1 : 0;
+}
+
+/* The edge of a path that lags most, if only newer samples are missing at a stamp; borrowed. `limit` becomes the newest
+ * stamp that any other edge may reach before it loses this one. */
+static const History *
+lagging_edge(const Chain *path, int64_t at, int64_t *limit)
+{
+    const History *lagging = NULL;
+    int64_t least = INT64_MAX;
+    *limit = INT64_MAX;
+    for (Py_ssize_t i = 0; i < path->up + path->down; i++) {
+        const History *edge = path->steps[i].edge;
+        if (edge == NULL) {
+            continue;
+        }
+        const Samples samples = samples_of(edge);
+        if (edge->mixed || samples.count == 0 || at < samples.stamps[0]) {
+            return NULL;
+        }
+        const int64_t newest = samples.stamps[samples.count - 1];
+        if (newest < at && newest < least) {
+            least = newest;
+            lagging = edge;
+        }
+    }
+    for (Py_ssize_t i = 0; lagging != NULL && i < path->up + path->down; i++) {
+        const History *edge = path->steps[i].edge;
+        if (edge == NULL || edge == lagging || edge->keep < 0) {
+            continue;
+        }
+        const Samples samples = samples_of(edge);
+        const Py_ssize_t next = lower_bound(samples.stamps, samples.count, at);
+        const int exact = next < samples.count && samples.stamps[next] == at;
+        const int64_t before = samples.stamps[exact ? next : next - 1];
+        int64_t lasts = before > INT64_MAX - edge->keep ? INT64_MAX : before + edge->keep;
+        if (next + exact == samples.count && lasts < at) {
+            lasts = at;
+        }
+        *limit = lasts < *limit ? lasts : *limit;
+    }
+    return lagging;
+}
+
+/* Put a waiter into the line of a frame, and its first limit among the limits. */
+static int
+feed_line_up(Feed *self, Parked *waiter, PyObject *child, int64_t at, int64_t limit, PyObject *orders)
+{
+    PyObject *lines = self->parts[LINES], *names = PyTuple_Pack(1, child), *old = waiter->names;
+    if (names == NULL) {
+        return -1;
+    }
+    waiter->names = names;
+    Py_XDECREF(old);
+    if (PyDict_SetItem(self->parts[PARKED], OBJECT(waiter), Py_None) < 0) {
+        return -1;
+    }
+    PyObject *line = PyDict_GetItemWithError(lines, child);
+    Py_XINCREF(line);
+    if (line == NULL) {
+        line = PyErr_Occurred() ? NULL : PyObject_CallNoArgs(OBJECT(LineType));
+        if (line == NULL || PyDict_SetItem(lines, child, line) < 0) {
+            Py_XDECREF(line);
+            return -1;
+        }
+    }
+    int failed = 1;
+    if (!PyObject_TypeCheck(line, LineType) || ((Line *)line)->places == NULL) {
+        PyErr_SetString(PyExc_TypeError, "the lines must be lines");
+    } else {
+        failed = line_up(((Line *)line)->places, &waiter->place, waiter, at, orders) < 0
+                 || (limit < INT64_MAX && line_up(self->parts[LIMITS], &waiter->limit, waiter, limit, orders) < 0);
+    }
+    Py_DECREF(line);
+    return failed ? -1 : 0;
+}
+
+/* park(waiter, orders, passed): park a waiter if newer samples are all that its question lacks. False, and nothing is
+ * done, if Python has to look closer. After an error, Python removes what is in the index. */
+static PyObject *
+feed_park(Feed *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    int64_t at, limit, passed;
+    if (nargs != 3 || !PyObject_TypeCheck(args[0], ParkedType) || !PyIter_Check(args[1])) {
+        PyErr_SetString(PyExc_TypeError, "park takes a parked lookup, an iterator of numbers and a stamp");
+        return NULL;
+    }
+    PyObject *asked[3];
+    int overflow;
+    if (read_stamp(args[2], &passed) < 0) {
+        return NULL;
+    }
+    if (self->parts[PATHS] == NULL || !is_plain((Parked *)args[0], asked) || !PyLong_CheckExact(asked[2])) {
+        Py_RETURN_FALSE;
+    }
+    at = PyLong_AsLongLongAndOverflow(asked[2], &overflow);
+    const Chain *path = overflow || at == INT64_MIN ? NULL : paths_find((Paths *)self->parts[PATHS], asked[0], asked[1]);
+    const History *edge = path == NULL || !path->alone ? NULL : lagging_edge(path, at, &limit);
+    if (edge == NULL || limit < passed) {
+        return PyErr_Occurred() ? NULL : PyBool_FromLong(0);
+    }
+    PyObject *child = PyObject_GetAttr(OBJECT(edge), child_string);
+    const int failed = child == NULL || feed_line_up(self, (Parked *)args[0], child, at, limit, args[1]) < 0;
+    Py_XDECREF(child);
+    return failed ? NULL : PyBool_FromLong(1);
+}
+
 /* Whether the wake-ups of a batch are plain: only lookups that need a stamp wait for its frames, nobody watches them,
  * and no sample has passed the first limit. -1 for an error. */
 static int
@@ -237,13 +423,12 @@ feed_pop(PyObject *lines, PyObject *child, Line *line, Py_ssize_t last)
 static void
 feed_answer(const Feed *self, Parked *waiter)
 {
-    PyObject *plain = waiter->plain;
-    if (plain == NULL || !PyTuple_CheckExact(plain) || PyTuple_Size(plain) != 3) {
+    PyObject *asked[3], *question = waiter->question;
+    if (!is_plain(waiter, asked)) {
         return;
     }
     Paths *paths = (Paths *)self->parts[PATHS];
-    PyObject *asked[3] = {PyTuple_GetItem(plain, 0), PyTuple_GetItem(plain, 1), PyTuple_GetItem(plain, 2)};
-    Py_INCREF(plain);
+    Py_INCREF(question);
     PyObject *old = waiter->answer, *answer = paths_answer(paths, asked, 3);
     waiter->answer = answer;
     waiter->version = paths->version;
@@ -252,7 +437,7 @@ feed_answer(const Feed *self, Parked *waiter)
         PyErr_Clear();
     }
     Py_XDECREF(old);
-    Py_DECREF(plain);
+    Py_DECREF(question);
 }
 
 /* Wake the lookups that a sample at a stamp has unblocked, each with its answer if that is plain. After an error of
@@ -277,6 +462,9 @@ feed_wake(const Feed *self, PyObject *child, int64_t stamp, Trouble *trouble)
             break;
         }
         Parked *waiter = (Parked *)item;
+        if (drop_limit(self->parts[LIMITS], waiter) < 0) {
+            set_aside(trouble);
+        }
         if (waiter->elsewhere) {
             PyObject *done = PyObject_CallFunctionObjArgs(self->parts[FORGET], item, NULL);
             if (done == NULL) {
@@ -353,6 +541,9 @@ feed_insert(Feed *self, PyObject *batch)
 }
 
 static PyMethodDef feed_methods[] = {
+    {"park", FAST(feed_park), METH_FASTCALL,
+     PyDoc_STR("park(waiter, orders, passed): park a plain lookup under the edge that lags most, if newer samples are all "
+               "that it lacks; else do nothing.")},
     {"insert", (PyCFunction)feed_insert, METH_O,
      PyDoc_STR("insert(batch): store a batch and wake the lookups that it has unblocked, if all is plain; else do "
                "nothing.")},

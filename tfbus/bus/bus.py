@@ -70,12 +70,16 @@ class OwnerThread:
         self.entered: WeakSet[object] = WeakSet()
         _OWNERS.add(self)
 
+    def is_here(self) -> bool:
+        """Whether this thread owns the bus, and has run an event loop with it."""
+        return get_ident() == self.thread and self._on_a_loop
+
     def check(self) -> None:
         """Raise `RuntimeError` unless this thread owns the bus, or runs an event loop and may take it over."""
-        thread = get_ident()
-        if thread == self.thread and self._on_a_loop:
+        if self.is_here():
             return
         self.check_process()
+        thread = get_ident()
         on_a_loop = _runs_a_loop()
         if thread != self.thread:
             if self._on_a_loop or not on_a_loop:
