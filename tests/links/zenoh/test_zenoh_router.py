@@ -1,11 +1,15 @@
 from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest
+import zenoh
 from support.processes import free_address, until
 from support.zenoh_wires import LIVE, Ear, Way, listening, met, start_router, talk, way_to
 
 from tfbus.links.seams import Joined, Left
+from tfbus.links.zenoh import zenoh_router
+from tfbus.links.zenoh.neighbours import Neighbours
 from tfbus.links.zenoh.sessions import router_config
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
 
@@ -85,6 +89,41 @@ async def test_an_address_in_use_is_an_os_error_and_a_router_is_entered_once(add
             await router.__aenter__()
     async with ZenohRouter(address):
         pass
+
+
+@pytest.mark.parametrize("breaks", ["at first", "later"])
+async def test_a_router_whose_session_breaks_at_once_says_so_at_first_and_later_has_another_one(
+    breaks: str, address: str, domain: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds: list[Any] = [Broken] if breaks == "at first" else [Silent, Broken]
+    monkeypatch.setattr(zenoh_router, "Neighbours", lambda session: (kinds.pop(0) if kinds else Neighbours)(session))
+    if breaks == "at first":
+        with pytest.raises(OSError, match="the session of a router broke at once: closed"):
+            async with ZenohRouter(address):
+                raise AssertionError("it has opened")
+    async with (
+        ZenohRouter(address),
+        listening(domain, connect=address) as one,
+        listening(domain, connect=address) as two,
+    ):
+        await until(lambda: not kinds)
+        await met(one, two)
+        await talk(one, two)
+
+
+class Broken(Neighbours):
+    """A session that has broken before anything is declared."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        super().__init__(session)
+        raise zenoh.ZError("closed")
+
+
+class Silent(Neighbours):
+    """A router that is told nothing from the beginning."""
+
+    def are_silent(self, now: float) -> bool:  # noqa: ARG002 - at any time
+        return True
 
 
 RULES = """{
