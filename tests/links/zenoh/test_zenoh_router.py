@@ -1,3 +1,4 @@
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,26 @@ async def test_links_that_listen_and_connect_to_each_other_hear_each_other_after
         listening(domain, listen=other, connect=back.address, lease=1.0) as two,
     ):
         await hear_each_other_after_each_break(one, two, way, back)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_routers_in_a_ring_tell_each_other_all_after_breaks_that_follow_fast(domain: str) -> None:
+    addresses = [free_address() for _ in range(3)]
+    async with AsyncExitStack() as stack:
+        ways = [await stack.enter_async_context(way_to(address)) for address in addresses]
+        for address, way in zip(addresses, ways[1:] + ways[:1], strict=True):
+            stack.enter_context(start_router(address, way.address))
+        ears = [await stack.enter_async_context(listening(domain, connect=address)) for address in addresses]
+        for breaks in range(1, 4):
+            await met(*ears)
+            await talk(*ears)
+            for _ in range(breaks):
+                await until(lambda: all(way.open for way in ways))
+                for way in ways:
+                    await way.cut()
+        await met(*ears)
+        await talk(*ears)
 
 
 async def hear_each_other_after_each_break(one: Ear, two: Ear, way: Way, back: Way) -> None:

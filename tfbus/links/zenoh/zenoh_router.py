@@ -9,7 +9,7 @@ import anyio
 import anyio.to_thread
 import zenoh
 
-from tfbus.links.zenoh.neighbours import PAUSE_TO_LISTEN, PERIOD, Neighbours, open_router
+from tfbus.links.zenoh.neighbours import PAUSE_TO_BEGIN, PAUSE_TO_LISTEN, PERIOD, Neighbours, open_router
 from tfbus.links.zenoh.sessions import (
     Addresses,
     Keeper,
@@ -120,3 +120,4 @@ class ZenohRouter:
                 close_session(router)
             else:
                 begin_to_close(router)
+                keeper.rest(PAUSE_TO_BEGIN)
