@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.asking import Asked, driving, settle
-from support.samples import any_samples, edges_of, moving, static
+from support.samples import any_samples, edges_of, latched, moving, static
 
 from tfbus import (
     SECOND,
@@ -341,6 +341,9 @@ def test_statistics_count_everything_on_the_bus() -> None:
     assert counted.queues == (QueueStatistics("stream", "conflate", capacity=7, pending=2, dropped=0),)
     buffer.close()
     assert bus.statistics().buffers == ()
+    for again in (static("map", "a"), moving("map", "a", 3)):
+        bus.publish(again)
+    assert (bus.statistics().kind_changes, [*latched(bus)]) == (2, ["s"])
 
 
 @pytest.mark.thorough
