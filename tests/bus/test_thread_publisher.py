@@ -218,8 +218,7 @@ async def test_a_bus_made_on_a_loop_belongs_to_the_thread_of_that_loop() -> None
 
 
 @pytest.mark.parametrize("names", [{}, {"prefix": "robot/", "shared": {"map"}}], ids=["whole names", "prefix"])
-async def test_threads_may_call_every_reading_method_while_lookups_wait_and_wake(names: Any) -> None:
-    bus = Bus(SimulatedClock())
+async def test_threads_may_call_every_reading_method_while_lookups_wait_and_wake(bus: Bus, names: Any) -> None:
     buffer = Buffer(bus, keep=1e-6, **names)
     frame = names.get("prefix", "") + "a"
     bus.publish(moving("map", frame, 0))
