@@ -152,7 +152,8 @@ async def check_link_that_came_back(make_link: Callable[[Bus], RosLink], peer: A
         for _ in range(2):
             async with make_link(bus), anyio.create_task_group() as tasks:
                 tasks.start_soon(program.send)
-                await buffer.lookup("odom", "tool", timeout=20.0)
+                # A stamp that nobody has sent yet.
+                await buffer.lookup("odom", "tool", time.time_ns() + SECOND // 10, timeout=20.0)
                 await anyio.sleep(1.0)
                 tasks.cancel_scope.cancel()
         facts = await other.next_line()
