@@ -256,8 +256,8 @@ set_string_of(PyObject *self, PyObject *value, void *closure)
     return 0;
 }
 
-/* The row of a @ b: tfbus.rows.compose. `out` may be `b`. */
-static void
+/* The row of a @ b: tfbus.rows.compose. `out` may be `b`. Inlined, so that a product of many rows stays in registers. */
+static inline Py_ALWAYS_INLINE void
 compose(const double *a, const double *b, double *out)
 {
     const double ai = a[3], aj = a[4], ak = a[5], aw = a[6];

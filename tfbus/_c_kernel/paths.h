@@ -96,6 +96,18 @@ chain_init(Chain *self, PyObject *args, PyObject *kwargs)
 static const unsigned char each[LANES] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 11, 12, 13, 14, 15,
                                           16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
 
+/* The product of `count` rows, the last one first, times `product`; of the rows alone if `begins`. */
+static void
+climb(const double *const *rows, Py_ssize_t count, int begins, double *product)
+{
+    double row[WIDTH];
+    memcpy(row, begins ? rows[0] : product, ROW_SIZE);
+    for (Py_ssize_t i = begins; i < count; i++) {
+        compose(rows[i], row, row);
+    }
+    memcpy(product, row, ROW_SIZE);
+}
+
 /* Source in target at a stamp. */
 static Status
 chain_at(const Chain *self, int64_t at, double *out)
@@ -105,36 +117,46 @@ chain_at(const Chain *self, int64_t at, double *out)
     memcpy(out, identity, ROW_SIZE);
     for (Py_ssize_t first = 0; first < steps; first += LANES) {
         const Py_ssize_t count = steps - first < LANES ? steps - first : LANES;
+        const double *rows[LANES];
         Segment segments[LANES];
-        Turn turns[LANES];
-        int64_t stamps[LANES];
-        double rows[LANES][WIDTH];
+        unsigned char which[LANES];
+        Py_ssize_t between = 0;
         for (Py_ssize_t i = 0; i < count; i++) {
             const Step *step = &self->steps[first + i];
-            stamps[i] = at;
+            rows[i] = step->row;
             if (step->edge == NULL) {
-                segments[i].a = NULL;
-                segments[i].b = step->row;
                 continue;
             }
             if (step->edge->mixed) {
                 return NOT_PLAIN;
             }
             const Samples samples = samples_of(step->edge);
-            const Status status = find_segment(&samples, at, &segments[i]);
+            const Status status = find_segment(&samples, at, &segments[between]);
             if (status != ANSWERED) {
                 return status;
             }
-        }
-        find_turns(segments, turns, count);
-        blend(segments, turns, each, stamps, count, rows[0], WIDTH, 1);
-        for (Py_ssize_t i = 0; i < count; i++) {
-            double *side = first + i < self->up ? out : below;
-            if (first + i == 0 || first + i == self->up) {
-                memcpy(side, rows[i], ROW_SIZE);
-            } else {
-                compose(rows[i], side, side);
+            rows[i] = segments[between].b;
+            if (segments[between].a != NULL) {
+                which[between++] = (unsigned char)i;
             }
+        }
+        double blended[LANES][WIDTH];
+        if (between > 0) {
+            Turn turns[LANES];
+            int64_t stamps[LANES];
+            find_turns(segments, turns, between);
+            for (Py_ssize_t i = 0; i < between; i++) {
+                stamps[i] = at;
+                rows[which[i]] = blended[i];
+            }
+            blend(segments, turns, each, stamps, between, blended[0], WIDTH, 1);
+        }
+        const Py_ssize_t up = first + count <= self->up ? count : first < self->up ? self->up - first : 0;
+        if (up > 0) {
+            climb(rows, up, first == 0, out);
+        }
+        if (up < count) {
+            climb(rows + up, count - up, first + up == self->up, below);
         }
     }
     if (self->down > 0) {

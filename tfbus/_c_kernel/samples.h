@@ -1171,10 +1171,18 @@ samples_of(const History *edge)
 static Status
 find_segment(const Samples *samples, int64_t at, Segment *segment)
 {
-    if (samples->count == 0 || at < samples->stamps[0] || at > samples->stamps[samples->count - 1]) {
+    const Py_ssize_t last = samples->count - 1;
+    if (last < 0 || at > samples->stamps[last]) {
         return MISSING;
     }
-    const Py_ssize_t i = lower_bound(samples->stamps, samples->count, at);
+    /* Behind the last but one are most of the stamps that `LATEST` asks for. */
+    Py_ssize_t i = last;
+    if (at != samples->stamps[last] && (last == 0 || at <= samples->stamps[last - 1])) {
+        if (at < samples->stamps[0]) {
+            return MISSING;
+        }
+        i = lower_bound(samples->stamps, samples->count, at);
+    }
     segment->after = samples->stamps[i];
     segment->a = NULL;
     segment->b = samples->rows + WIDTH * i;
