@@ -42,7 +42,7 @@ static PyTypeObject *ColumnsType, *SampleType, *BlockType, *HistoryType, *ChainT
 static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType, *MethodType;
 static PyObject *empty_string, *raise_string, *drop_string, *at_string, *paths_string, *memory_string;
 static PyObject *source_at_string, *fixed_string, *max_age_string, *not_before_string, *not_after_string;
-static PyObject *tolerance_string, *max_gap_string, *extrapolate_string, *nanoseconds_string, *policy_use_string;
+static PyObject *tolerance_string, *max_gap_string, *extrapolate_string, *nanoseconds_string, *policy_use_string, *error_string;
 static PyObject *bound_method; /* types.MethodType */
 static PyObject *array_type;   /* numpy.ndarray; NULL until somebody asks with an array */
 
