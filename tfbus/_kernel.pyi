@@ -84,6 +84,7 @@ class Paths:
     recent: dict[str, dict[str, Chain]]
     inserted: int
     now: Any
+    qualified: Any
     version: int
     def __init__(self, lock: Any, latest: object, kind: type[Sample], /) -> None: ...
     def answer(self, target: str, source: str, at: object, /) -> Any: ...
