@@ -44,7 +44,7 @@ from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_duration, from
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.history import Edge
 from tfbus.tree.lookup import Bounds, Question, answer
-from tfbus.waiting.live_tree import LiveTree, PendingLookup, Waiter, WaitingIndex, blocking_frames, without_traceback
+from tfbus.waiting.live_tree import PendingLookup, Share, Waiter, blocking_frames, without_traceback
 
 
 def running_loop() -> Any:
@@ -315,12 +315,12 @@ class HangingReport:
 
     Parameters
     ----------
-    waiting : WaitingIndex
+    share : Share
     clock : Clock
     """
 
-    def __init__(self, waiting: WaitingIndex, clock: Clock) -> None:
-        self._waiting = waiting
+    def __init__(self, share: Share, clock: Clock) -> None:
+        self._share = share
         self._clock = clock
         self._told = SeenKeys(_LOOKED_AT)
         self._last: int | None = None
@@ -342,7 +342,8 @@ class HangingReport:
         self._told.add(_cause(blocker))
         named = [PendingLookup(question, since, blocker)]
         untold = 0
-        for pending in islice(self._waiting.waiting_since(now - from_seconds(REPORT_AFTER)), _LOOKED_AT):
+        long = (each for each in self._share.pending() if each.since <= now - from_seconds(REPORT_AFTER))
+        for pending in islice(long, _LOOKED_AT):
             if self._told.add(_cause(pending.blocked_by)):
                 if len(named) < NAMED:
                     named.append(pending)
@@ -420,24 +421,31 @@ class Lookups:
 
     Parameters
     ----------
-    live : LiveTree
+    share : Share
+        The buffer's share of the live tree.
     bus : Bus
         Its clock measures timeouts and ages; it says which thread may wait here.
     local_names : LocalNames, optional
         Translates the answers. Questions, errors and log lines have the names of the bus.
+
+    Attributes
+    ----------
+    forest : Forest
+        The forest that answers.
     """
 
     def __init__(
         self,
-        live: LiveTree,
+        share: Share,
         bus: Bus,
         local_names: LocalNames | None = None,
     ) -> None:
-        self.live = live
+        self.share = share
+        self.forest = share.live.forest
         self.bus = bus
         self._clock = bus.clock
         self._local_names = local_names
-        self._report = HangingReport(live.waiting, bus.clock)
+        self._report = HangingReport(share, bus.clock)
         self._alarms = alarms_of(bus.clock)
 
     def bounds(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> Bounds | None:
@@ -459,14 +467,14 @@ class Lookups:
         """The answer, or an error at once."""
         bounds = None
         if question.is_plain:
-            plain = self.live.forest.paths.answer(question.target, question.source, question.at)
+            plain = self.forest.paths.answer(question.target, question.source, question.at)
             if plain is not None:
                 return plain if self._local_names is None else self._local_names.answer(plain)
         if question.max_age is not None:
             bounds = self.bounds(question.max_age, question.at, question.source_at)
         try:
             found = answer(
-                self.live.forest,
+                self.forest,
                 question.target,
                 question.source,
                 question.at,
@@ -488,7 +496,7 @@ class Lookups:
         `others` are further questions that need an answer: if waiting cannot help one of them, its error is raised.
         """
         limit = math.inf if timeout is None else as_duration(timeout, "timeout")
-        last_reset = self.live.last_reset
+        last_reset = self.share.live.last_reset
         await anyio.lowlevel.checkpoint()
         try:
             return self._lookup_since(last_reset, question)
@@ -506,7 +514,7 @@ class Lookups:
             raise _timed_out(wait, limit) from wait.blocker
         # Inline, because every further coroutine would be resumed one by one.
         self._set_alarms(wait, limit, alarms)
-        waiting, paths = self.live.waiting, self.live.forest.paths
+        waiting, paths = self.share.live.waiting, self.forest.paths
         try:
             while True:
                 waiter = self._park(wait)
@@ -549,12 +557,12 @@ class Lookups:
 
     def _park(self, wait: "_Wait") -> Waiter:
         """Park a lookup under the frames that block it, with a new wake-up."""
-        live = self.live
-        if live.end_reason is not None:
-            raise BusClosedError(live.end_reason) from wait.blocker
+        share = self.share
+        if share.end_reason is not None:
+            raise BusClosedError(share.end_reason) from wait.blocker
         wait.woken, wait.wake = wake_up()
         waiter = Waiter(wait.question, wait.since, wait.wake, wait.others)
-        live.park(waiter, wait.blocker)
+        share.park(waiter, wait.blocker)
         return waiter
 
     def _ask_again(self, wait: "_Wait") -> TransformStamped | None:
@@ -590,7 +598,7 @@ class Lookups:
                         try:
                             await wait.woken
                         finally:
-                            self.live.waiting.remove(waiter)
+                            self.share.live.waiting.remove(waiter)
                         found = self._ask_again(wait)
                 if found is None:
                     pause = min(self.report(wait.question, wait.since, wait.blocker), REPORT_AFTER)
@@ -599,7 +607,7 @@ class Lookups:
 
     def _lookup_since(self, last_reset: ClockResetError | None, question: Question) -> TransformStamped:
         """The answer, or `ClockResetError` if the clock has jumped back after `last_reset`."""
-        latest = self.live.last_reset
+        latest = self.share.live.last_reset
         if latest is not None and latest is not last_reset:
             raise ClockResetError(before=latest.before, after=latest.after)
         return self.lookup_nowait(question)
@@ -608,7 +616,7 @@ class Lookups:
         """Raise `UnknownFrameError` for a name that can never be the name of a frame."""
         for name in (question.target, question.source, question.fixed):
             if name is not None and not is_frame(name):
-                raise UnknownFrameError(frame=name, known=self.live.forest.some_frames()) from None
+                raise UnknownFrameError(frame=name, known=self.forest.some_frames()) from None
 
 
 def _timed_out(wait: _Wait, limit: float) -> LookupTimeoutError:
