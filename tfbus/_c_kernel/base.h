@@ -41,7 +41,8 @@ enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quat
 static PyTypeObject *ColumnsType, *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
 static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType, *MethodType;
 static PyObject *empty_string, *raise_string, *drop_string, *at_string, *paths_string, *memory_string;
-static PyObject *child_string, *source_at_string, *fixed_string, *max_age_string, *not_before_string, *not_after_string;
+static PyObject *child_string, *passed_string;
+static PyObject *source_at_string, *fixed_string, *max_age_string, *not_before_string, *not_after_string;
 static PyObject *bound_method; /* types.MethodType */
 static PyObject *array_type;   /* numpy.ndarray; NULL until somebody asks with an array */
 
