@@ -3,7 +3,7 @@
 `Feed`, `Intake` and `Method` have no twin: without the compiled kernel the ordinary way runs; see `tfbus.which_kernel`.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 Vector = tuple[float, float, float]
@@ -108,13 +108,16 @@ class Judge:
 
 class Parked:
     answer: Any
+    asked: Any
     elsewhere: bool
     limit: Any
     names: tuple[str, ...] | None
     place: Any
-    question: Any
+    since: int
     version: int
     wake: Any
+    def __init__(self, asked: Any, since: int, wake: Any) -> None: ...
+    def __await__(self) -> Any: ...
 
 class Line:
     @property
@@ -125,6 +128,8 @@ class Line:
     def limits(self) -> list[Any]: ...
 
 class Feed:
+    begin: Any
+    kind: type[Parked]
     def __init__(
         self,
         paths: Paths,
@@ -134,11 +139,11 @@ class Feed:
         parked: Mapping[Any, None],
         limits: list[Any],
         watches: Mapping[str, Any],
-        forget: Any,
+        index: Any,
         /,
     ) -> None: ...
+    def ask(self, target: str, source: str, at: Any, turn: bool, /) -> Any: ...
     def insert(self, batch: tuple[Sample, ...], /) -> bool: ...
-    def park(self, waiter: Parked, orders: Iterator[int], passed: int, /) -> bool: ...
 
 class Intake:
     feeds: tuple[tuple[Any, Any], ...]

@@ -162,12 +162,17 @@ Place = tuple[int, int, Any]
 class Parked:
     """The part of a parked lookup that a wake-up needs.
 
-    Attributes
+    Parameters
     ----------
-    question : tuple
-        Target, source and stamp, and options. It is plain, so that the kernel may answer it, if all options are None.
+    asked : tuple
+        Target, source and stamp, and options. If all options are None, it is plain: the kernel may answer it.
+    since : int
+        The stamp at which the lookup began to wait, in ns.
     wake : callable
         Called once, without arguments, after it was taken out of its line.
+
+    Attributes
+    ----------
     names : tuple of str or None
         The frames that block it.
     place : tuple or None
@@ -182,14 +187,17 @@ class Parked:
         Whether its wake-up has to remove it from more than its line, these limits and the dict of all parked lookups.
     """
 
-    question: Any
-    wake: Callable[[], object]
     names: tuple[str, ...] | None = None
     place: Place | None = None
     limit: Place | None = None
     answer: Any = None
     version: int = 0
     elsewhere: bool = False
+
+    def __init__(self, asked: Any, since: int, wake: Callable[[], object]) -> None:
+        self.asked = asked
+        self.since = since
+        self.wake = wake
 
 
 class Line:

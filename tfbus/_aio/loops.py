@@ -7,10 +7,10 @@ counts the calls of that method. If there was no call between two turns of the s
 scheduled earlier has run, and nothing is left to run.
 """
 
-import asyncio
 import logging
 import sys
 import threading
+from asyncio import get_running_loop
 from collections.abc import Awaitable, Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import Context, copy_context
@@ -33,22 +33,33 @@ def _turn() -> Generator[None, None, None]:
     yield
 
 
+def on_asyncio() -> bool:
+    """Whether the running task is one of asyncio, which takes a bare yield of None as a checkpoint."""
+    return _here.name is None
+
+
 def checkpoint() -> Awaitable[None]:
-    """`anyio.lowlevel.checkpoint`, without the way through anyio: asyncio takes a bare yield as a turn of the loop."""
-    return _turn() if _here.name is None else _trio().lowlevel.checkpoint()
+    """`anyio.lowlevel.checkpoint`, without the way through anyio."""
+    return _turn() if _here.name is None else _lowlevel().checkpoint()
 
 
 def running_loop() -> Any:
     """The running event loop: the loop object of asyncio, or the token of trio."""
-    return asyncio.get_running_loop() if _here.name is None else _trio().lowlevel.current_trio_token()
+    return get_running_loop() if _here.name is None else _lowlevel().current_trio_token()
 
 
-def _trio() -> Any:
-    return sys.modules["trio"]
+def _lowlevel() -> Any:
+    return sys.modules["trio.lowlevel"]
 
 
-def wake_up(loop: Any) -> tuple[Awaitable[None], Callable[[], object]]:
-    """A wait of one task on the running loop, to be awaited once, and the function that ends it.
+@coroutine
+def asleep(sleep: Generator[Any, None, None]) -> Generator[Any, None, None]:
+    """Sleep as `wake_up` says."""
+    yield from sleep
+
+
+def wake_up(loop: Any) -> tuple[Generator[Any, None, None], Callable[[], object]]:
+    """The sleep of one task on the running loop, to be iterated once by that task, and the function that ends it.
 
     If it was ended before the task awaits it, there is no checkpoint. The function may raise an `Exception` if the wait
     has ended, or the event loop is closed.
@@ -56,9 +67,9 @@ def wake_up(loop: Any) -> tuple[Awaitable[None], Callable[[], object]]:
     if _here.name is None:
         # No function of Python is then on the way from a publish to the event loop.
         future = loop.create_future()
-        return future, partial(future.set_result, None)
+        return future.__await__(), partial(future.set_result, None)
     woken = _TrioWakeUp()
-    return woken, woken.end
+    return woken.sleep(), woken.end
 
 
 class _TrioWakeUp:
@@ -76,24 +87,20 @@ class _TrioWakeUp:
             self._ended = True
             task, self._task = self._task, None
             if task is not None:
-                _trio().lowlevel.reschedule(task)
+                _lowlevel().reschedule(task)
 
-    def __await__(self) -> Generator[Any, None, None]:
-        if self._ended:
-            return _turnless()
-        lowlevel = _trio().lowlevel
-        self._task = lowlevel.current_task()
-        return cast(Generator[Any, None, None], lowlevel.wait_task_rescheduled(self._abort).__await__())
+    def sleep(self) -> Generator[Any, None, None]:
+        """Sleep until `end` is called."""
+        if not self._ended:
+            lowlevel = _lowlevel()
+            self._task = lowlevel.current_task()
+            yield from lowlevel.wait_task_rescheduled(self._abort).__await__()
 
     def _abort(self, _raise_cancel: object) -> Any:
         """End the wait, because trio has cancelled it."""
         self._task = None
         self._ended = True
-        return _trio().lowlevel.Abort.SUCCEEDED
-
-
-def _turnless() -> Generator[Any, None, None]:
-    yield from ()
+        return _lowlevel().Abort.SUCCEEDED
 
 
 class LoopWaker:

@@ -1,11 +1,10 @@
 """The buffer: a tree that a bus fills, and lookups that wait for missing transforms."""
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Any, SupportsIndex, TypeVar
 
-from tfbus._aio.loops import checkpoint
+from tfbus._aio.loops import checkpoint, on_asyncio
 from tfbus.buffer.lookups import LocalNames, Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
@@ -124,6 +123,8 @@ class Buffer:
         self._forest = self._lookups.forest = forest
         self._paths = forest.paths if self._local_names is None else forest.local_paths()
         self._paths.now = self.bus.clock.now
+        plain = self._local_names is None and self._lookups.has_alarms and forest is self._share.live.forest
+        self._feed = self._lookups.feed if plain else None
 
     @property
     def tree(self) -> TransformTree:
@@ -249,16 +250,29 @@ class Buffer:
         TypeError
             If a stamp is a float, or `max_age` comes without a `LATEST`.
         """
-        policy = policy_of(tolerance, max_gap, extrapolate)
-        question = Question(target, source, as_at(at), as_at(source_at), fixed, max_age, policy)
-        limit = math.inf if timeout is None else as_duration(timeout, "timeout")
+        waits_plainly = max_age is None and source_at is None and fixed is None and not tolerance
+        if self._feed is None or not waits_plainly or max_gap is not None or extrapolate is not None:
+            policy = policy_of(tolerance, max_gap, extrapolate)
+            question = Question(target, source, as_at(at), as_at(source_at), fixed, max_age, policy)
+            return await self._lookups.lookup(self._on_bus(question), timeout)
         last_reset = self._share.live.last_reset
-        await checkpoint()
-        if question.is_plain and self._share.live.last_reset is last_reset:
-            found: TransformStamped | None = self._paths.answer(target, source, at)
-            if found is not None:
-                return found
-        return await self._lookups.wait(self._on_bus(question), limit, last_reset)
+        turn = on_asyncio()
+        wait = self._feed.ask(target, source, at, turn)
+        if timeout is not None:
+            wait.patience = as_duration(timeout, "timeout")
+        try:
+            if not turn:
+                await checkpoint()
+            found: TransformStamped | None = await wait
+            if found is None or self._share.live.last_reset is not last_reset:
+                wait.asked = Question(target, source, as_at(at))
+                return await self._lookups.go_on(wait, last_reset)
+        except BaseException:
+            self._lookups.end(wait)
+            raise
+        if wait.cancel_end is not None:
+            wait.cancel_end()
+        return found
 
     async def _lookup_among(self, questions: Sequence[Question]) -> None:
         """Wait until each question has had an answer; if waiting cannot help one of them, raise its error at once.

@@ -14,7 +14,8 @@ all others that have.
 import logging
 import math
 import sys
-from collections.abc import Awaitable, Callable, Iterator
+from asyncio import get_running_loop
+from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -22,7 +23,7 @@ from heapq import heapify, heappop, heappush
 from itertools import count
 from typing import Any, Protocol, cast
 
-from tfbus._aio.loops import checkpoint, running_loop, wake_up
+from tfbus._aio.loops import asleep, checkpoint, running_loop, wake_up
 from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import SeenKeys
 from tfbus.clock import Clock, SimulatedClock, SystemClock
@@ -321,11 +322,10 @@ class HangingReport:
         return max(first, REPORT_AFTER)
 
 
-class _Wait(Waiter):
+class Wait(Waiter):
     """A lookup that waits, from its first error to its end."""
 
-    loop: Any
-    woken: Awaitable[None]
+    sleep: Generator[Any, None, None]
     expired = False
     cancel_end: Cancel | None = None
 
@@ -353,6 +353,8 @@ class Lookups:
     ----------
     forest : Forest
         The forest that answers.
+    feed : Feed or None
+        Asks for this buffer, and parks its lookups; only the compiled kernel has one.
     """
 
     def __init__(
@@ -365,12 +367,22 @@ class Lookups:
         self.forest = share.live.forest
         self.bus = bus
         self._clock = bus.clock
+        self._now = bus.clock.now
+        self._is_here = bus._is_here
         self._local_names = local_names
         self._alarms = alarms_of(bus.clock)
         self._report = HangingReport(share, bus.clock, self.blocker)
         # The loop on which the next look at the lookups that hang is due, if one is, and the function that cancels it.
         self._looking_on: Any = None
         self._cancel_look: Cancel = _nothing
+        self.feed = share.live.make_feed()
+        if self.feed is not None:
+            self.feed.kind, self.feed.begin = Wait, self.begin
+
+    @property
+    def has_alarms(self) -> bool:
+        """Whether a wait needs no cancel scopes."""
+        return self._alarms is not None
 
     def bounds(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> Bounds | None:
         """The stamps that count as `LATEST` now; None for any."""
@@ -419,57 +431,69 @@ class Lookups:
 
         `others` are further questions that need an answer: if waiting cannot help one of them, its error is raised.
         """
-        limit = math.inf if timeout is None else as_duration(timeout, "timeout")
+        wait = Wait(question, 0, _nothing)
+        wait.share, wait.others = self.share, others
+        if timeout is not None:
+            wait.patience = as_duration(timeout, "timeout")
         last_reset = self.share.live.last_reset
         await checkpoint()
-        return await self.wait(question, limit, last_reset, others)
+        return await self.go_on(wait, last_reset)
 
-    async def wait(
-        self,
-        question: Question,
-        limit: float,
-        last_reset: ClockResetError | None,
-        others: tuple[Question, ...] = (),
-    ) -> TransformStamped:
-        """As `lookup`, for a task that has passed the checkpoint, at most for some time in s.
+    async def go_on(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:
+        """As `lookup`, for a task that has passed the checkpoint, and may have been woken.
 
         Every jump back of the clock after `last_reset` ends it.
         """
-        wait = _Wait(question, self._clock.now(), _nothing, others)
-        wait.share, wait.patience = self.share, limit
-        found = self._ask(wait, last_reset)
-        if found is not None:
-            return found
+        wait.since = wait.since or self._clock.now()
         if self._alarms is None:
-            return await self._wait_in_scopes(wait, last_reset, limit)
+            return await self._wait_in_scopes(wait, last_reset)
         waiting, paths = self.share.live.waiting, self.forest.paths
         try:
-            if limit == 0.0:
-                wait.expired = True
-            elif limit < math.inf:
-                wait.cancel_end = self._alarms.call_after(limit, wait.expire)
             while True:
-                if self._looking_on is not wait.loop:
-                    self._look_after(max(REPORT_AFTER - to_seconds(self._clock.now() - wait.since), 0.0))
-                try:
-                    # Timeouts of zero give the others a turn as well.
-                    await (checkpoint() if wait.expired else wait.woken)
-                except BaseException:
-                    waiting.remove(wait)
-                    raise
+                waiting.remove(wait)
+                if wait.expired:
+                    return self._last_answer(wait, last_reset)
+                found = self._ask(wait, last_reset)
+                if found is not None:
+                    return found
+                # Timeouts of zero give the others a turn as well.
+                await (checkpoint() if wait.expired else asleep(wait.sleep))
                 found = wait.answer
                 if found is not None and wait.version == paths.version:
                     # Nothing has changed since the insertion woke and removed the waiter.
                     return found if self._local_names is None else self._local_names.answer(found)
-                waiting.remove(wait)
-                if wait.expired:
-                    return self._last_answer(wait, last_reset, limit)
-                found = self._ask(wait, last_reset)
-                if found is not None:
-                    return found
         finally:
-            if wait.cancel_end is not None:
-                wait.cancel_end()
+            self.end(wait)
+
+    def begin(self, wait: Wait, on_asyncio: bool) -> Generator[Any, None, None] | None:
+        """The sleep of a lookup that the kernel is about to park; None if it must not. Called by the kernel."""
+        if self.share.end_reason is not None or wait.patience == 0.0:
+            return None
+        wait.share = self.share
+        if on_asyncio:
+            # As `wake_up`, which takes twice as long to call.
+            loop = get_running_loop()
+            future = loop.create_future()
+            wait.wake = partial(future.set_result, None)
+            sleep = future.__await__()
+        else:
+            loop = running_loop()
+            sleep, wait.wake = wake_up(loop)
+        wait.since = self._now()
+        if self._looking_on is not loop:
+            # Else this thread has been checked.
+            if not self._is_here():
+                return None
+            self._look_after(REPORT_AFTER)
+        if wait.patience < math.inf:
+            self._set_end(wait)
+        return sleep
+
+    def end(self, wait: Wait) -> None:
+        """Leave nothing of a wait behind."""
+        self.share.live.waiting.remove(wait)
+        if wait.cancel_end is not None:
+            wait.cancel_end()
 
     def pending(self, most: int | None = None) -> Iterator[PendingLookup]:
         """All waiting lookups, or the first few, with the errors that block them. For any thread."""
@@ -489,24 +513,18 @@ class Lookups:
         """Log the lookups that have waited for long; return the time, in s, after which to call this again."""
         return self._report.tell()
 
-    def _ask(self, wait: _Wait, last_reset: ClockResetError | None) -> TransformStamped | None:
+    def _ask(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped | None:
         """The answer; or None, after parking the lookup under the frames that block it, with a new wake-up."""
-        live, ended = self.share.live, self.share.end_reason
-        if live.last_reset is last_reset and ended is None and not wait.others and self.bus._owner.is_here():
-            wait.blocked_by = None
-            self._renew(wait)
-            if live.park_plainly(wait):
-                return None
         found = self._look(wait, last_reset)
         if found is None and wait.blocked_by is not None:
             self.bus._check_thread()
-            if ended is not None:
-                raise BusClosedError(ended) from wait.blocked_by
-            self._renew(wait)
-            live.park(wait, wait.blocked_by)
+            if self.share.end_reason is not None:
+                raise BusClosedError(self.share.end_reason) from wait.blocked_by
+            wait.sleep = self._fall_asleep(wait)
+            self.share.park(wait, wait.blocked_by)
         return found
 
-    def _look(self, wait: _Wait, last_reset: ClockResetError | None) -> TransformStamped | None:
+    def _look(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped | None:
         """The answer; or None, after noting the error that blocks it."""
         latest = self.share.live.last_reset
         if latest is not None and latest is not last_reset:
@@ -522,19 +540,31 @@ class Lookups:
                 self.lookup_nowait(other)
         return None
 
-    def _last_answer(self, wait: _Wait, last_reset: ClockResetError | None, limit: float) -> TransformStamped:
-        """The answer of a wait whose time (s) is up: the data may have come in the same turn of the loop."""
+    def _last_answer(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:
+        """The answer of a wait whose time is up: the data may have come in the same turn of the loop."""
         found = self._look(wait, last_reset)
         if found is not None:
             return found
         target, source, *_ = wait.question
         missing = cast(TransformLookupError, wait.blocked_by)
-        raise LookupTimeoutError(target=target, source=source, timeout=limit, missing=missing) from missing
+        raise LookupTimeoutError(target=target, source=source, timeout=wait.patience, missing=missing) from missing
 
-    def _renew(self, wait: _Wait) -> None:
-        """Give a lookup a new wake-up."""
-        wait.loop = loop = running_loop()
-        wait.woken, wait.wake = wake_up(loop)
+    def _fall_asleep(self, wait: Wait) -> Generator[Any, None, None]:
+        """The sleep of a lookup, with a new wake-up. Its alarms are set the first time."""
+        loop = running_loop()
+        sleep, wait.wake = wake_up(loop)
+        if self._looking_on is not loop and self._alarms is not None:
+            self._look_after(max(REPORT_AFTER - to_seconds(self._now() - wait.since), 0.0))
+        self._set_end(wait)
+        return sleep
+
+    def _set_end(self, wait: Wait) -> None:
+        """Set the alarm for the end of a wait, if it has an end and no alarm."""
+        if wait.patience < math.inf and wait.cancel_end is None and self._alarms is not None:
+            if wait.patience == 0.0:
+                wait.expired = True
+            else:
+                wait.cancel_end = self._alarms.call_after(wait.patience, wait.expire)
 
     def _look_after(self, pause: float) -> None:
         """Look at the lookups that hang after some time (s), unless that is infinite."""
@@ -545,23 +575,23 @@ class Lookups:
         else:
             self._looking_on, self._cancel_look = None, _nothing
 
-    async def _wait_in_scopes(self, wait: _Wait, last_reset: ClockResetError | None, limit: float) -> TransformStamped:
-        """Wait for the answer for some time (s) by a clock that knows no alarms."""
+    async def _wait_in_scopes(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:
+        """Wait for the answer by a clock that knows no alarms."""
+        found = self._ask(wait, last_reset)
         pause = REPORT_AFTER
-        found = None
-        with self._clock.move_on_after(limit):
+        with self._clock.move_on_after(wait.patience):
             while found is None:
                 with self._clock.move_on_after(pause):
                     while found is None:
                         try:
-                            await wait.woken
+                            await asleep(wait.sleep)
                         finally:
                             self.share.live.waiting.remove(wait)
                         found = self._ask(wait, last_reset)
                 if found is None:
                     found = self._ask(wait, last_reset)
                     pause = min(self.report(), REPORT_AFTER)
-        return self._last_answer(wait, last_reset, limit) if found is None else found
+        return self._last_answer(wait, last_reset) if found is None else found
 
     def _check_names(self, question: Question) -> None:
         """Raise `UnknownFrameError` for a name that can never be the name of a frame."""

@@ -221,6 +221,8 @@ class Bus:
             self._intake = Intake(self._topology.judge, TransformStamped, self._tell, listeners, busy)
             self._take = self._intake.take
         self._owner = OwnerThread(self._intake)
+        # Whether this thread owns the bus, and has run an event loop with it. Called by buffers.
+        self._is_here = self._owner.is_here
         self._resets = 0
         self._removals = 0
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.

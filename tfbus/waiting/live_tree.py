@@ -158,18 +158,10 @@ class PendingLookup:
 class Waiter(Parked):
     """A parked lookup.
 
-    Parameters
-    ----------
-    question : Question
-    since : int
-        The stamp at which the lookup began to wait, in ns.
-    wake : callable
-        Called once, after the waiter was popped from the index.
-    others : tuple of Question
-        Further questions that need an answer: the waiter is woken when one of them can no longer have an answer.
-
     Attributes
     ----------
+    others : tuple of Question
+        Further questions that need an answer: the waiter is woken when one of them can no longer have an answer.
     share : Share or None
         The share of the buffer that asks.
     patience : float
@@ -182,27 +174,24 @@ class Waiter(Parked):
         Whether the index has noted the names of its questions.
     """
 
-    question: Question
+    others: tuple[Question, ...] = ()
     share: "Share | None" = None
     patience = math.inf
     blocked_by: TransformLookupError | None = None
     limits: list[tuple[str, Place]] | None = None
     indexed = False
 
-    def __init__(
-        self, question: Question, since: int, wake: Callable[[], object], others: tuple[Question, ...] = ()
-    ) -> None:
-        self.question = question
-        self.since = since
-        self.wake = wake
-        self.others = others
+    @property
+    def question(self) -> Question:
+        """The question that it asks."""
+        return Question(*self.asked)
 
     @property
     def cause(self) -> Hashable:
         """Equal for waiters that wait for the same."""
         return FutureExtrapolationError if self.blocked_by is None else type(self.blocked_by), self.names
 
-    def asked(self) -> set[str]:
+    def frames(self) -> set[str]:
         """The frames that the questions name."""
         names = {self.question.target, self.question.source}
         if self.question.fixed is not None:
@@ -422,7 +411,7 @@ class WaitingIndex:
             if waiter.limits:
                 self._forget_limits(waiter)
             if waiter.indexed:
-                for name in waiter.asked():
+                for name in waiter.frames():
                     waiters = self._by_name.get(name)
                     if waiters is not None:
                         waiters.pop(waiter, None)
@@ -438,7 +427,7 @@ class WaitingIndex:
         fresh = list(takewhile(lambda waiter: not waiter.indexed, reversed(self.parked)))
         for waiter in reversed(fresh):
             waiter.indexed = waiter.elsewhere = True
-            for name in waiter.asked():
+            for name in waiter.frames():
                 self._by_name.setdefault(name, {})[waiter] = None
         return self._by_name
 
@@ -525,19 +514,23 @@ class LiveTree:
         self._watches = self.watching.by_frame
         # What still reads the forest for a buffer that was closed since the last change.
         self._closed: list[ref[ReadsForest]] = []
-        waiting = self.waiting
-        self.feed: Any = None
-        if Feed is not None:
-            self.feed = Feed(
-                forest.paths,
-                forest.frames,
-                forest.readers,
-                waiting.by_frame,
-                waiting.parked,
-                waiting.limits,
-                self.watching.by_frame,
-                waiting.forget,
-            )
+        self.feed = self.make_feed()
+
+    def make_feed(self) -> Any:
+        """A `Feed` of this tree; None without the compiled kernel."""
+        if Feed is None:
+            return None
+        forest, waiting = self.forest, self.waiting
+        return Feed(
+            forest.paths,
+            forest.frames,
+            forest.readers,
+            waiting.by_frame,
+            waiting.parked,
+            waiting.limits,
+            self.watching.by_frame,
+            waiting,
+        )
 
     def insert(self, batch: Batch) -> None:
         """Insert a batch that the bus has judged, and wake the lookups and watches that it concerns."""
@@ -579,10 +572,6 @@ class LiveTree:
         """
         blocking = (error.child,) if isinstance(error, FutureExtrapolationError) else ()
         self.waiting.park(waiter, error, self._limits(waiter, blocking))
-
-    def park_plainly(self, waiter: Waiter) -> bool:
-        """As `park`, without an error, if newer samples are all that the waiter lacks and the kernel can tell so."""
-        return self.feed is not None and self.feed.park(waiter, self.waiting.orders, self.waiting.passed)
 
     def remove_frame(self, frame: str) -> None:
         """Forget a frame, if it is known, and wake the lookups and watches that it concerns."""
