@@ -20,15 +20,17 @@ DROP_LOST = pytest.mark.parametrize("drop_lost", [False, True], ids=["kept", "dr
 
 
 @pytest.fixture
-def processes() -> Iterator[Crowd]:
-    with crowd() as together:
-        yield together
-
-
-@pytest.fixture
 def directory() -> Iterator[Path]:
     with short_directory() as path:
         yield path
+
+
+@pytest.fixture
+def processes(directory: Path) -> Iterator[Crowd]:
+    # They end before the directory vanishes, in which they would show their names again meanwhile.
+    del directory
+    with crowd() as together:
+        yield together
 
 
 def tell(capsys: pytest.CaptureFixture[str], line: str) -> None:

@@ -518,6 +518,28 @@ async def test_links_meet_although_the_directory_has_vanished(directory: str, lo
         await ear_one.until(lambda: ear_one.messages(two.id) == [b"still here"])
 
 
+def is_private(path: Path) -> bool:
+    return path.stat().st_mode & 0o777 == 0o700
+
+
+async def test_a_directory_that_vanishes_while_a_link_opens_is_made_again_for_its_user_alone(
+    directory: str, loopback: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, mkdir = Path(directory, "run"), os.mkdir
+    vanishes = [True]
+
+    def vanish_and_make(path: Path, mode: int = 0o777) -> None:
+        if path.parent == root and vanishes:
+            root.rmdir()
+            vanishes.clear()
+        mkdir(path, mode)
+
+    monkeypatch.setattr(os, "mkdir", vanish_and_make)
+    async with pair(str(root), loopback):
+        assert not vanishes
+        assert is_private(root)
+
+
 @pytest.mark.every_loop
 async def test_links_work_where_the_system_has_no_poll_object_that_is_a_file(
     directory: str, loopback: bool, monkeypatch: pytest.MonkeyPatch

@@ -48,16 +48,24 @@ def runtime_directory() -> Path:
     return Path(tempfile.gettempdir(), name)
 
 
-def make_private(directory: Path) -> None:
+def make_private(directory: Path, *, parents: bool) -> None:
     """Make a directory that only its user can enter.
+
+    Parameters
+    ----------
+    directory : Path
+    parents : bool
+        Whether to make the directories above it too, which others may be able to enter.
 
     Raises
     ------
     PermissionError
         If it is another user's, or others can enter it, or it cannot be made.
+    FileNotFoundError
+        If it has vanished again, or the directory above it is not there and need not be made.
     """
     try:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        directory.mkdir(mode=0o700, parents=parents, exist_ok=True)
         found = directory.lstat()
     except (PermissionError, FileExistsError, NotADirectoryError) as error:
         problem = f"{directory} cannot be made a directory ({error.strerror}): make it one with mode 700, {_OTHERWISE}"
@@ -118,12 +126,12 @@ class MeetingPlace:
         """
         self.name = self.name or f"{time.time_ns():016x}{self._link[:8]}"
         for attempts_left in (2, 1, 0):
-            make_private(self._root)
-            make_private(self._folder)
             try:
+                make_private(self._root, parents=True)
+                make_private(self._folder, parents=False)
                 return self._listen(self._folder / f".{self.name}")
             except FileNotFoundError:
-                # The last link that left has removed the folder meanwhile.
+                # The last link that left has removed the folder meanwhile, or somebody has removed all.
                 if not attempts_left:
                     raise
         raise AssertionError
