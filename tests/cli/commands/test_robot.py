@@ -137,6 +137,7 @@ def test_the_tree_of_a_pr2_has_its_83_frames(tfbus: Command) -> None:
         (["swing=left"], "joint 'swing': position 'left' is not a number"),
         (["swing=1,2"], "joint 'swing': position '1,2' is not one number"),
         (["swing=nan"], "joint 'swing': position nan is not finite"),
+        (["rope=1e13"], "the translation of 'hook' in 'boom' is 1e+13 m long, which is not physical"),
         (["screw=1"], "joint 'screw' is fixed and has no position"),
         (["swing=1", "swing=2"], "joint 'swing' has two positions"),
         (["wheels=1"], "joint 'wheels': position must be 3 numbers, got shape (1,)"),

@@ -243,15 +243,17 @@ def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(
     assert turns.told == [1, "first", "bad", "last", 0]
 
 
-def test_a_thread_that_has_ended_has_let_go_of_its_readers(domain_number: int) -> None:
+def test_a_thread_that_has_ended_has_let_go_of_its_readers_and_of_what_it_made(domain_number: int) -> None:
     with domain(domain_number, CONFIG), ExitStack() as stack:
         participant = DomainParticipant(domain_number)
         stack.callback(delete, participant)
         reader: DataReader[Any] = DataReader(participant, Topic(participant, "rt/text", RawString))
+        before = len(participant.get_children())
         thread = ReaderThread(participant, print)
         thread.watch(reader, bool, lambda _: None)
         thread.start()
         thread.stop()
+        assert len(participant.get_children()) == before
         delete(reader)
         gone = weakref.ref(reader)
         del reader
