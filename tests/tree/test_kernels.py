@@ -491,7 +491,7 @@ REFUSALS = TypeError, ValueError, LookupError, AttributeError, BufferError, Runt
 @needs_both
 def test_no_call_with_any_arguments_crashes_the_compiled_kernel() -> None:
     kernel: Any = COMPILED
-    kinds = [kind for kind in vars(kernel).values() if isinstance(kind, type)]
+    kinds: list[Any] = [kind for kind in vars(kernel).values() if isinstance(kind, type)]
     for seed in range(40):
         rng = random.Random(seed)
         path = chain(kernel, [[(0, x(0.0))]], [])
