@@ -253,3 +253,9 @@ def bus(clock: SimulatedClock) -> Iterator[Bus]:
 def buffer(bus: Bus) -> Iterator[Buffer]:
     with Buffer(bus) as buffer:
         yield buffer
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A place for a recording."""
+    return tmp_path / "run.mcap"

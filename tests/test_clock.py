@@ -151,7 +151,6 @@ async def test_sleep_until_ends_when_a_jump_passes_its_stamp(clock: SimulatedClo
 
 
 async def test_move_on_after_counts_simulated_time_across_jumps(clock: SimulatedClock) -> None:
-
     async def wait() -> int:
         with clock.move_on_after(3.0) as scope:
             await anyio.sleep_forever()
@@ -223,7 +222,6 @@ async def test_only_one_task_may_advance_a_clock_at_a_time(clock: SimulatedClock
 
 
 async def test_a_cancelled_advance_stops_at_its_current_time_and_can_be_resumed(clock: SimulatedClock) -> None:
-
     async def cancel_after_a_second() -> None:
         await clock.sleep(1.0)
         scope.cancel()

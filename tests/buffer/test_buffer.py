@@ -135,7 +135,6 @@ async def test_a_timeout_raises_with_the_last_error_as_its_cause() -> None:
 
 @pytest.mark.parametrize("timeout", [0.25, 4.999, 5.0, 5.001, 10.0, 3600.0])
 async def test_a_timeout_expires_on_the_clock_of_the_bus(clock: SimulatedClock, buffer: Buffer, timeout: float) -> None:
-
     async def ask() -> int:
         with pytest.raises(TimeoutError):
             await buffer.lookup("map", "a", timeout=timeout)
@@ -209,9 +208,6 @@ async def test_max_age_refuses_the_last_sample_of_a_dead_broadcaster() -> None:
     with pytest.raises(FutureExtrapolationError) as caught:
         buffer.lookup_nowait("map", "a", max_age=1.0)
     assert (caught.value.child, caught.value.stamp, caught.value.newest) == ("a", 1_000_000, 0)
-
-
-# Waking
 
 
 # Pending lookups and the log
@@ -361,14 +357,20 @@ async def test_transform_waits_for_the_stamp_of_the_data(bus: Bus, buffer: Buffe
     assert buffer.transform_nowait(point, "map") == asked.answer
 
 
-async def test_transform_passes_timeout_and_max_age_on(clock: SimulatedClock, bus: Bus, buffer: Buffer) -> None:
-    bus.publish(driving("map", "base", 0))
+async def test_transform_passes_timeout_and_max_age_on_also_to_another_stamp(
+    clock: SimulatedClock, bus: Bus, buffer: Buffer
+) -> None:
+    bus.publish([driving("map", "base", 0), driving("map", "base", 2)])
     await clock.advance(9.0)
-    point = PointStamped("base", LATEST, (0.0, 0.0, 0.0))
-    with pytest.raises(LookupTimeoutError):
-        await buffer.transform(point, "map", timeout=0, max_age=1.0)
-    with pytest.raises(FutureExtrapolationError):
-        buffer.transform_nowait(point, "map", max_age=1.0)
+    latest, past = (PointStamped("base", stamp, (0.0, 0.0, 0.0)) for stamp in (LATEST, SECOND))
+    travel: dict[str, Any] = {"at": LATEST, "fixed": "map"}
+    for point, target, question in ((latest, "map", {}), (past, "base", travel)):
+        with pytest.raises(LookupTimeoutError):
+            await buffer.transform(point, target, timeout=0, max_age=1.0, **question)
+        with pytest.raises(FutureExtrapolationError):
+            buffer.transform_nowait(point, target, max_age=1.0, **question)
+    with pytest.raises(TypeError, match="max_age goes with LATEST"):
+        await buffer.transform(past, "base", max_age=1.0, at=2 * SECOND, fixed="map")
 
 
 async def test_transform_moves_data_to_another_stamp_through_a_fixed_frame(bus: Bus, buffer: Buffer) -> None:
@@ -380,19 +382,6 @@ async def test_transform_moves_data_to_another_stamp_through_a_fixed_frame(bus: 
     assert buffer.transform_nowait(point, "base", at=5 * SECOND, fixed="map") == moved
     back = PointStamped("laser", 5 * SECOND, (-2.0, 0.0, 0.0))
     assert buffer.transform_nowait(back, "laser", at=2 * SECOND, fixed="map").point == (1.0, 0.0, 0.0)
-
-
-async def test_transform_to_another_stamp_passes_timeout_and_max_age_on() -> None:
-    clock, bus, buffer = make()
-    bus.publish([driving("map", "base", 0), driving("map", "base", 2)])
-    await clock.advance(9.0)
-    point = PointStamped("base", SECOND, (0.0, 0.0, 0.0))
-    with pytest.raises(LookupTimeoutError):
-        await buffer.transform(point, "base", timeout=0, max_age=1.0, at=LATEST, fixed="map")
-    with pytest.raises(FutureExtrapolationError):
-        buffer.transform_nowait(point, "base", max_age=1.0, at=LATEST, fixed="map")
-    with pytest.raises(TypeError, match="max_age goes with LATEST"):
-        await buffer.transform(point, "base", max_age=1.0, at=2 * SECOND, fixed="map")
 
 
 class Smell:

@@ -284,12 +284,7 @@ def test_a_local_name_survives_the_way_to_the_bus_and_back(text: str, shared: se
     assume(not any(other.startswith(text) for other in shared))
     prefix = Prefix(text, shared)
     assert prefix.local(prefix.on_bus(name)) == name
-
-
-@given(names, st.sets(names, max_size=3), names)
-def test_a_frame_without_a_local_name_gets_a_leading_slash(text: str, shared: set[str], name: str) -> None:
-    assume(not any(other.startswith(text) for other in shared))
-    prefix = Prefix(text, shared)
+    # A frame without a local name gets a leading slash.
     local = prefix.local(name)
     assert local == f"/{name}" if local.startswith("/") else prefix.on_bus(local) == name
 

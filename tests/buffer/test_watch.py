@@ -354,7 +354,6 @@ async def test_an_available_answer_passes_a_checkpoint(bus: Bus, buffer: Buffer)
 
 
 def test_timeouts_and_cancellation_of_asyncio_work_with_a_watch(bus: Bus, buffer: Buffer) -> None:
-
     async def main() -> None:
         with buffer.watch("map", "a") as changes:
             with pytest.raises(TimeoutError):

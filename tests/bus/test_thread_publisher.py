@@ -188,7 +188,6 @@ USES: list[Callable[[Bus, Buffer], object]] = [
 def test_a_bus_made_before_a_loop_belongs_to_the_thread_of_its_first_loop(
     bus: Bus, buffer: Buffer, run: Run, use: Callable[[Bus, Buffer], object]
 ) -> None:
-
     async def take_over() -> None:
         use(bus, buffer)
 
@@ -271,7 +270,6 @@ async def test_a_thread_hears_of_a_wrong_type_or_length_and_a_stamp_ahead_is_cou
 
 
 def test_a_loop_in_the_thread_that_made_the_bus_leaves_it_to_no_other_loop(bus: Bus, run: Run) -> None:
-
     async def use() -> None:
         bus.events().close()
 

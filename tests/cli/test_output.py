@@ -46,12 +46,6 @@ def test_results_go_to_standard_output_and_everything_else_to_standard_error(
     assert capsys.readouterr() == ("a result\n", "a notice\ntfbus: a warning\n")
 
 
-def test_a_notice_is_one_line_whatever_names_are_in_it(capsys: pytest.CaptureFixture[str]) -> None:
-    say("waiting for x\ny\x1b[2J")
-    warn("no x\rtfbus: all is well")
-    assert capsys.readouterr().err == "waiting for x\\ny\\x1b[2J\ntfbus: no x\\rtfbus: all is well\n"
-
-
 class Screen(io.StringIO):
     def isatty(self) -> bool:
         return True

@@ -5,7 +5,7 @@ import json
 import math
 import pickle
 from collections.abc import Callable
-from dataclasses import FrozenInstanceError, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -161,13 +161,6 @@ def test_data_without_arrays_compare_by_value(data: Any) -> None:
     assert twin == data
     assert hash(twin) == hash(data)
     assert replace(data, stamp=8) != data
-
-
-@pytest.mark.parametrize("data", ONE_OF_EACH, ids=name_of)
-def test_data_are_immutable(data: Any) -> None:
-    with pytest.raises(FrozenInstanceError):
-        data.frame = "odom"
-    assert not hasattr(data, "__dict__")
 
 
 def test_clouds_and_scans_view_the_given_arrays_which_stay_writable() -> None:

@@ -12,18 +12,11 @@ from tfbus import (
     Buffer,
     Bus,
     LookupTimeoutError,
-    SimulatedClock,
     TransformStamped,
 )
 
 
-def make() -> tuple[Bus, Buffer]:
-    bus = Bus(SimulatedClock())
-    return bus, Buffer(bus)
-
-
 def test_asyncio_timeout_ends_a_wait(buffer: Buffer) -> None:
-
     async def main() -> None:
         with pytest.raises(TimeoutError) as caught:
             async with asyncio.timeout(0.001):
@@ -39,7 +32,6 @@ def test_asyncio_timeout_ends_a_wait(buffer: Buffer) -> None:
 
 
 def test_wait_for_ends_a_wait_and_passes_an_answer_on(bus: Bus, buffer: Buffer) -> None:
-
     async def main() -> None:
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(buffer.lookup("map", "a"), 0.001)
@@ -51,7 +43,6 @@ def test_wait_for_ends_a_wait_and_passes_an_answer_on(bus: Bus, buffer: Buffer) 
 
 
 def test_a_task_group_that_fails_takes_its_waits_with_it(buffer: Buffer) -> None:
-
     async def fail() -> None:
         await settle()
         assert len(buffer.pending()) == 3
@@ -70,7 +61,6 @@ def test_a_task_group_that_fails_takes_its_waits_with_it(buffer: Buffer) -> None
 
 
 def test_a_cancelled_task_is_cancelled_and_leaves_nothing_behind(bus: Bus, buffer: Buffer) -> None:
-
     async def main() -> None:
         tasks = [asyncio.create_task(buffer.lookup("map", "a")) for _ in range(3)]
         await settle()
@@ -111,7 +101,6 @@ def test_a_task_that_is_cancelled_in_the_turn_of_its_answer_or_its_timeout_is_ca
 
 
 def test_a_stream_is_read_by_a_task(bus: Bus) -> None:
-
     async def main() -> None:
         with bus.stream(overflow="drop_oldest") as stream:
             task = asyncio.create_task(anext(stream))

@@ -313,7 +313,6 @@ def test_nothing_is_taken_of_a_link_that_was_not_announced_or_has_gone(scene: Sc
 
 
 def test_a_subscriber_that_raises_hears_all_the_same_and_one_that_closes_the_bus_ends_a_message(scene: Scene) -> None:
-
     def fail(batch: Sequence[TransformStamped]) -> None:
         raise ValueError(batch[0].child)
 

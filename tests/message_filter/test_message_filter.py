@@ -265,7 +265,6 @@ async def test_a_transform_in_the_turn_in_which_the_timeout_expires_delivers_the
 async def test_an_exception_of_the_callback_is_isolated_and_logged_once(
     bus: Bus, buffer: Buffer, streams: Streams, caplog: pytest.LogCaptureFixture
 ) -> None:
-
     def clumsy(_message: Scan, _reason: DropReason, _error: TransformError | None) -> None:
         raise ValueError("spilt the coffee")
 
@@ -631,7 +630,6 @@ def test_an_asyncio_timeout_around_a_filter_raises_a_timeout_error(around: str) 
 
 @pytest.mark.parametrize("where", ["waiting", "in the body", "with an answer"])
 def test_a_cancelled_asyncio_task_with_a_filter_is_cancelled(bus: Bus, buffer: Buffer, where: str) -> None:
-
     async def reading() -> None:
         async with MessageFilter(Source(StopAsyncIteration(), Scan(5)), buffer, "map") as pairs:
             async for _ in pairs:

@@ -62,8 +62,7 @@ def test_messages_that_the_recorder_has_compressed_are_unfolded_and_what_cannot_
     assert (found.stamps.tolist(), found.unreadable) == ([1_500_000_000], 1)
 
 
-def test_a_damaged_chunk_is_one_that_is_unreadable(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_a_damaged_chunk_is_one_that_is_unreadable(path: Path) -> None:
     write_mcap(path, LINES, schema=POINT, definition=b"", chunk_size=1, use_statistics=False)
     data = bytearray(path.read_bytes())
     data[data.index(point(1_500_000_000))] ^= 1
@@ -72,8 +71,7 @@ def test_a_damaged_chunk_is_one_that_is_unreadable(tmp_path: Path) -> None:
     assert (found.stamps.tolist(), found.from_headers, found.unreadable) == ([0, 3_000_000_000], True, 1)
 
 
-def test_a_cut_file_has_no_unreadable_message(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_a_cut_file_has_no_unreadable_message(path: Path) -> None:
     write_mcap(path, LINES, schema=POINT, definition=b"", chunk_size=1)
     path.write_bytes(path.read_bytes()[:-20])
     found = header_stamps(path, "/points")

@@ -220,10 +220,7 @@ TEXT = b"Dear diary,\ntoday I have driven a robot.\n"
     ],
     ids=lambda value: repr(value[:24]),
 )
-def test_other_files_are_refused_with_an_error_of_one_line(
-    tmp_path: Path, content: bytes, reason: str, says: str
-) -> None:
-    path = tmp_path / "run.mcap"
+def test_other_files_are_refused_with_an_error_of_one_line(path: Path, content: bytes, reason: str, says: str) -> None:
     path.write_bytes(content)
     with pytest.raises(RecordingError) as raised:
         open_recording(path)
@@ -319,8 +316,7 @@ def test_all_topics_are_told_and_those_that_may_hold_transforms_and_are_not_read
         assert recording.remarks == ("not read: 1 messages on topic /camera/tf of type unknown",)
 
 
-def test_positions_of_joints_are_remarked_where_there_are_no_transforms(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_positions_of_joints_are_remarked_where_there_are_no_transforms(tmp_path: Path, path: Path) -> None:
     hint = "/joint_states has the positions of joints: load_joint_states reads them with a URDF"
     for kind in ("sensor_msgs/msg/JointState", "sensor_msgs/JointState"):
         write_mcap(path, [(1, "/joint_states", b"")], schema=kind)

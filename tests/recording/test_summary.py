@@ -170,14 +170,10 @@ def test_the_newest_parent_of_a_frame_decides_what_closes_a_loop(
     assert summary.messages == len(lines)
 
 
-def test_a_summary_is_frozen_data(tmp_path: Path) -> None:
+def test_a_summary_is_a_value(path: Path) -> None:
     summary = summary_of(SMALL)
     assert pickle.loads(pickle.dumps(summary)) == summary
-    for each, name in ((summary, "messages"), (summary.frames[0], "moving"), (summary.senders[0], "moving")):
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            setattr(each, name, 0)
-    path = write_mcap(tmp_path / "run.mcap", [])
-    assert summary_of(path) == RecordingSummary(path, True, None, None, 0, 0, (), (), {})
+    assert summary_of(write_mcap(path, [])) == RecordingSummary(path, True, None, None, 0, 0, (), (), {})
 
 
 def test_a_duration_or_a_span_needs_both_ends() -> None:

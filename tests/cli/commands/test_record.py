@@ -41,9 +41,8 @@ async def until_recording() -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_it_records_what_is_published_until_a_signal_comes(
-    tmp_path: Path, tfbus: Command, backend: str, number: signal.Signals, status: int
+    path: Path, tfbus: Command, backend: str, number: signal.Signals, status: int
 ) -> None:
-    path = tmp_path / "run.mcap"
     latched = static("base_link", "camera", authority="me")
     laser = moving("base_link", "laser", time.time_ns(), authority="driver")
 
@@ -64,8 +63,7 @@ def test_it_records_what_is_published_until_a_signal_comes(
         assert sum(1 for _ in make_reader(file).iter_messages()) == 2
 
 
-def test_it_ends_when_the_duration_is_over(tmp_path: Path, tfbus: Command) -> None:
-    path = tmp_path / "run.mcap"
+def test_it_ends_when_the_duration_is_over(path: Path, tfbus: Command) -> None:
     done = tfbus.on_domain(nobody, "record", path, "--duration", "0", "--domain", "yard", clock=SystemClock())
     assert (done.returncode, done.stdout) == (0, "")
     assert done.stderr == f"recording domain 'yard' to {path}\n0 samples in {path}\n"
@@ -109,8 +107,7 @@ def test_lost_samples_are_warned_of(tmp_path: Path, tfbus: Command) -> None:
     assert "tfbus: the disk is too slow: samples are lost, 1000 so far" in done.stderr.splitlines()
 
 
-def test_an_existing_file_is_kept_unless_it_may_be_overwritten(tmp_path: Path, tfbus: Command) -> None:
-    path = tmp_path / "run.mcap"
+def test_an_existing_file_is_kept_unless_it_may_be_overwritten(path: Path, tfbus: Command) -> None:
     path.write_text("precious")
     command = ("record", path, "--duration", "0")
     done = tfbus.on_domain(nobody, *command, clock=SystemClock())
@@ -127,8 +124,7 @@ def test_a_file_that_cannot_be_written_is_one_line_and_status_2(tmp_path: Path, 
 
 
 @pytest.mark.thorough
-def test_a_full_disk_ends_it_with_status_1_and_what_there_was_room_for(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_a_full_disk_ends_it_with_status_1_and_what_there_was_room_for(path: Path) -> None:
     domain, address = new_domain(), free_address()
     # `ulimit` counts blocks of 512 bytes or of a KiB.
     limited = f'ulimit -f 8; exec "{TFBUS}" record "{path}" --domain {domain} --listen {address}'

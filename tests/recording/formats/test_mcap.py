@@ -115,8 +115,7 @@ def test_a_file_with_an_index_knows_the_count_of_its_messages(write: Write) -> N
         assert errors_in(messages) == []
 
 
-def test_the_shortest_finished_file_is_an_empty_recording_and_with_a_byte_less_it_is_cut_off(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_the_shortest_finished_file_is_an_empty_recording_and_with_a_byte_less_it_is_cut_off(path: Path) -> None:
     magic = b"\x89MCAP0\r\n"
     footer = b"\x02" + (20).to_bytes(8, "little") + bytes(20)
     path.write_bytes(magic + footer + magic)
@@ -353,8 +352,7 @@ def test_messages_on_channels_that_are_not_described_are_counted(write: Write, u
         assert recording.count == len(EXPECTED) - 3
 
 
-def test_many_channels_that_claim_a_million_authorities_cost_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def test_many_channels_that_claim_a_million_authorities_cost_nothing(path: Path) -> None:
     with path.open("wb") as file:
         writer: Any = Writer(file)
         writer.start("ros2", "tests")
