@@ -18,9 +18,19 @@ from support import strategies as some
 from support.processes import peak_of
 from support.samples import moving
 
+import tfbus
 from tfbus import SECOND, InvalidTransformError, Transform, TransformStamped
 from tfbus.rows import IDENTITY, Row
-from tfbus.tf_message import MAX_NAME, MIN_SIZE, MalformedMessageError, decode, decode_in_parts, encode, refusal
+from tfbus.tf_message import (
+    MAX_NAME,
+    MIN_SIZE,
+    MalformedMessageError,
+    decode,
+    decode_in_parts,
+    encode,
+    plain_decoder,
+    refusal,
+)
 
 MESSAGE = "tf2_msgs/msg/TFMessage"
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -166,6 +176,27 @@ def test_a_message_in_parts_is_the_whole_one(most: int) -> None:
             for part in decode_in_parts(bad, 1, TransformStamped):
                 parts.append(part)
         assert len(parts) == sound
+
+
+@given(sendable, st.binary(max_size=9))
+def test_the_decoder_of_plain_messages_gives_the_same_or_nothing(
+    samples: list[TransformStamped], behind: bytes
+) -> None:
+    payload = encode(samples)
+    whole = decode(payload, [("me", True)] * len(samples), bare_names=True)
+    decode_plain = plain_decoder(("me", True), len(payload) + 4)
+    assert decode_plain(payload) in (None, tuple(whole.samples))
+    for other in (payload[:-1], payload[: len(behind)], payload + behind + b"\1", b"\0\0" + payload[2:], behind):
+        assert decode_plain(other) is None
+
+
+def test_the_compiled_kernel_knows_plain_messages_by_their_names() -> None:
+    payload = message_of(Part(), Part(child=b"arm"))
+    samples = decode(payload, [("me", False)] * 2, bare_names=True).samples
+    plain = tuple(samples) if tfbus.kernel == "compiled" else None
+    assert plain_decoder(("me", False), len(payload))(payload) == plain
+    assert plain_decoder(("me", False), len(payload) - 1)(payload) is None
+    assert plain_decoder(("me", False), len(payload))(message_of(Part(child=b"never heard of"))) is None
 
 
 def test_options_of_the_header_paddings_and_a_buffer_around_it_do_not_change_a_message() -> None:

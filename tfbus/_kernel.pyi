@@ -169,6 +169,14 @@ class Method:
 def decode(
     body: bytes, at: int, tags: tuple[tuple[str, bool], ...], names: Mapping[bytes, tuple[str, str]], kind: type[Any], /
 ) -> tuple[list[Any], int]: ...
+def decode_whole(
+    tags: tuple[tuple[str, bool]],
+    names: Mapping[bytes, tuple[str, str]],
+    kind: type[Any],
+    most: int,
+    payload: bytes,
+    /,
+) -> tuple[Any, ...] | None: ...
 def columns(
     parents: str | tuple[str, ...],
     children: str | tuple[str, ...],

@@ -832,6 +832,20 @@ def decode(
     return [], at
 
 
+def decode_whole(
+    tags: tuple[tuple[str, bool]],  # noqa: ARG001
+    names: Mapping[bytes, tuple[str, str]],  # noqa: ARG001
+    kind: type[SampleT],  # noqa: ARG001
+    most: int,  # noqa: ARG001
+    payload: bytes,  # noqa: ARG001
+) -> tuple[SampleT, ...] | None:
+    """The samples of a little endian message of at most `most` bytes with its header, if all are plain; else None.
+
+    There is one tag for all. Here none is plain, as in `decode`.
+    """
+    return None
+
+
 def columns(
     parents: str | tuple[str, ...],  # noqa: ARG001
     children: str | tuple[str, ...],  # noqa: ARG001

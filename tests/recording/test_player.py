@@ -137,6 +137,22 @@ async def test_samples_are_published_as_they_were_recorded(tmp_path: Path) -> No
     assert (player.played, player.messages, player.passes, player.bad) == (4, 3, 1, {})
 
 
+async def test_a_task_that_a_message_wakes_sees_all_messages_of_that_log_time(tmp_path: Path) -> None:
+    frames = ["base", *(f"f{number}" for number in range(9))]
+    lines = [(received, "/tf", [moving("map", frame, received)]) for received in (5, 7) for frame in frames]
+    path = write_mcap(tmp_path / "run.mcap", lines)
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+
+        async def look() -> tuple[int, int]:
+            await buffer.lookup("map", "base", 5)
+            return bus.clock.now(), buffer.lookup_nowait("map", "f8").stamp
+
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, look)
+            await Player(bus, path, rate=1.0).play()
+        assert asked.answer == (5, 5)
+
+
 async def test_messages_out_of_order_do_not_turn_the_clock_back(bus: Bus, tmp_path: Path) -> None:
     lines = [(received, "/tf", [moving("map", "base", received)]) for received in (5, 3, 9)]
     path = write_mcap(tmp_path / "run.mcap", lines, finish=False)

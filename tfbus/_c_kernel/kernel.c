@@ -37,6 +37,9 @@ static PyMethodDef module_methods[] = {
     {"decode", FAST(decode), METH_FASTCALL,
      PyDoc_STR("decode(body, at, tags, names, kind): the samples of a message up to the first that is not plain, and "
                "its offset.")},
+    {"decode_whole", FAST(decode_whole), METH_FASTCALL,
+     PyDoc_STR("decode_whole(tags, names, kind, most, payload): the samples of a message with its header, if all are "
+               "plain; else None.")},
     {"columns", FAST(columns), METH_FASTCALL,
      PyDoc_STR("columns(parents, children, stamps, rows, authority, static, square): the rows as a batch, or None if one "
                "is not plain. They are normalised in place.")},

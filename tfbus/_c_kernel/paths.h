@@ -829,11 +829,12 @@ paths_now(const Paths *self, int64_t *now)
 }
 
 /* Raise the error of a lookup at a stamp that a known path does not cover, if there is no other way, and the clock shows
- * that no sample of the deciding edge is ahead of it. Python words it, and here saves five calls on the way there. */
-static void
+ * that no sample of the deciding edge is ahead of it. Python makes the error; this saves the calls on the way there.
+ * Not inlined, because few calls need it. */
+Py_NO_INLINE static void
 paths_refuse(const Paths *self, PyObject *target, PyObject *source, PyObject *number)
 {
-    int64_t at, now = INT64_MAX;
+    int64_t at = 0, now = INT64_MAX;
     int overflow = 1;
     Chain *path = PyLong_CheckExact(number) ? paths_find(self, target, source) : NULL;
     if (path != NULL) {

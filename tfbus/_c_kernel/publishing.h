@@ -519,31 +519,24 @@ decoded_sample(PyTypeObject *kind, PyObject *names, PyObject *tag, int64_t stamp
     return OBJECT(sample);
 }
 
-/* Decode the plain samples at the beginning of a message: little endian, with names that were decoded before. */
+/* The plain samples of a message body from an offset on, at most `count`, as a list: little endian, with names that were
+ * decoded before. A single tag is that of all. */
 static PyObject *
-decode(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+decoded_samples(const char *body, int64_t size, int64_t *at, Py_ssize_t count, PyObject *tags, PyObject *names,
+                PyTypeObject *kind)
 {
-    if (nargs != 5 || !PyBytes_Check(args[0]) || !PyTuple_Check(args[2]) || !PyDict_Check(args[3])
-        || !PyType_Check(args[4]) || !PyType_IsSubtype((PyTypeObject *)args[4], SampleType)) {
-        PyErr_SetString(PyExc_TypeError, "decode takes bytes, an offset, tags, known names and a type of samples");
-        return NULL;
-    }
-    const char *body = PyBytes_AsString(args[0]);
-    const int64_t size = PyBytes_Size(args[0]);
-    int64_t at = PyLong_AsLongLong(args[1]);
-    const Py_ssize_t count = PyTuple_Size(args[2]);
-    PyObject *samples = at == -1 && PyErr_Occurred() ? NULL : PyList_New(0);
+    PyObject *samples = PyList_New(0);
     for (Py_ssize_t i = 0; samples != NULL && i < count; i++) {
         int32_t seconds;
         uint32_t nanoseconds, length;
         double row[WIDTH];
-        if (at < 0 || at > size - 12) {
+        if (*at < 0 || *at > size - 12) {
             break;
         }
-        memcpy(&seconds, body + at, 4);
-        memcpy(&nanoseconds, body + at + 4, 4);
-        memcpy(&length, body + at + 8, 4);
-        const int64_t middle = (at + 12 + length + 3) & -4;
+        memcpy(&seconds, body + *at, 4);
+        memcpy(&nanoseconds, body + *at + 4, 4);
+        memcpy(&length, body + *at + 8, 4);
+        const int64_t middle = (*at + 12 + length + 3) & -4;
         if (middle > size - 4) {
             break;
         }
@@ -559,12 +552,13 @@ decode(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
             || nanoseconds >= 1000000000) {
             break;
         }
-        PyObject *piece = PyBytes_FromStringAndSize(body + at + 8, (Py_ssize_t)(end - at - 8));
-        PyObject *names = piece == NULL ? NULL : PyDict_GetItemWithError(args[3], piece);
+        PyObject *piece = PyBytes_FromStringAndSize(body + *at + 8, (Py_ssize_t)(end - *at - 8));
+        PyObject *known = piece == NULL ? NULL : PyDict_GetItemWithError(names, piece);
         Py_XDECREF(piece);
-        PyObject *sample = names == NULL ? NULL
-                                         : decoded_sample((PyTypeObject *)args[4], names, PyTuple_GetItem(args[2], i),
-                                                          (int64_t)seconds * 1000000000 + nanoseconds, body + end);
+        PyObject *tag = PyTuple_GetItem(tags, PyTuple_Size(tags) == 1 ? 0 : i);
+        PyObject *sample = known == NULL ? NULL
+                                         : decoded_sample(kind, known, tag, (int64_t)seconds * 1000000000 + nanoseconds,
+                                                          body + end);
         if (sample == NULL || PyList_Append(samples, sample) < 0) {
             Py_XDECREF(sample);
             if (PyErr_Occurred()) {
@@ -573,7 +567,59 @@ decode(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
             break;
         }
         Py_DECREF(sample);
-        at = end + (int64_t)ROW_SIZE;
+        *at = end + (int64_t)ROW_SIZE;
     }
+    return samples;
+}
+
+/* Decode the plain samples at the beginning of a message. */
+static PyObject *
+decode(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 5 || !PyBytes_Check(args[0]) || !PyTuple_Check(args[2]) || !PyDict_Check(args[3])
+        || !PyType_Check(args[4]) || !PyType_IsSubtype((PyTypeObject *)args[4], SampleType)) {
+        PyErr_SetString(PyExc_TypeError, "decode takes bytes, an offset, tags, known names and a type of samples");
+        return NULL;
+    }
+    int64_t at = PyLong_AsLongLong(args[1]);
+    if (at == -1 && PyErr_Occurred()) {
+        return NULL;
+    }
+    PyObject *samples = decoded_samples(PyBytes_AsString(args[0]), PyBytes_Size(args[0]), &at, PyTuple_Size(args[2]),
+                                        args[2], args[3], (PyTypeObject *)args[4]);
     return samples == NULL ? NULL : Py_BuildValue("(NL)", samples, (long long)at);
+}
+
+/* decode_whole(tags, names, kind, most, payload): the samples of a message with its header as a tuple, if all are plain
+ * and nothing follows them; else None. */
+static PyObject *
+decode_whole(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 5 || !PyTuple_Check(args[0]) || PyTuple_Size(args[0]) != 1 || !PyDict_Check(args[1])
+        || !PyType_Check(args[2]) || !PyType_IsSubtype((PyTypeObject *)args[2], SampleType)) {
+        PyErr_SetString(PyExc_TypeError, "decode_whole takes a tag, known names, a type of samples, a size and bytes");
+        return NULL;
+    }
+    const Py_ssize_t most = PyLong_AsSsize_t(args[3]);
+    if (most == -1 && PyErr_Occurred()) {
+        return NULL;
+    }
+    if (!PyBytes_Check(args[4])) {
+        Py_RETURN_NONE;
+    }
+    const char *payload = PyBytes_AsString(args[4]);
+    const Py_ssize_t size = PyBytes_Size(args[4]) - 4;
+    uint32_t count = 0;
+    if (size < 4 || size + 4 > most || payload[0] != 0 || payload[1] != 1) {
+        Py_RETURN_NONE;
+    }
+    memcpy(&count, payload + 4, 4);
+    int64_t at = 4;
+    PyObject *samples = decoded_samples(payload + 4, size, &at, count, args[0], args[1], (PyTypeObject *)args[2]);
+    if (samples == NULL) {
+        return NULL;
+    }
+    PyObject *whole = PyList_Size(samples) == (Py_ssize_t)count && at == size ? PyList_AsTuple(samples) : Py_NewRef(Py_None);
+    Py_DECREF(samples);
+    return whole;
 }

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Generator, Iterator
 from contextlib import suppress
 from itertools import islice
@@ -102,6 +102,7 @@ _BLOCKS_AHEAD = 2
 _STEP = 0.02
 _MIN_STEP = 1e-9
 _MAX_STEP = 1e9
+_SAMPLES_AT_ONCE = 1_000
 _STRETCH = SECOND
 """In ns of the log: far less than buffers usually keep."""
 
@@ -338,40 +339,44 @@ class Player:
     async def _play_once(self, blocks: ReadAhead, since: int | None) -> None:
         started = False
         async for block in blocks:
-            messages = iter(block)
-            for message in messages:
+            ahead = deque(block)
+            while ahead:
+                due = ahead[0].received
                 if not started:
                     started = True
-                    self._begin(message.received if since is None else since)
-                self._playhead = message.received
-                await self._wait_for(message.received)
+                    self._begin(due if since is None else since)
+                self._playhead = due
+                await self._wait_for(due)
                 if self._seek_target is not None:
                     return
                 with self.bus._recorded_time():
-                    self._publish(message)
-                    if self._hurries:
-                        self._publish_at_once(messages, message.received + _STRETCH)
+                    self._publish(ahead.popleft())
+                    self._publish_at_once(ahead, due)
                 if self._paused:
                     # A step was taken.
                     self._steps = max(0, self._steps - 1)
                     self._origin = self._playhead
 
-    @property
-    def _hurries(self) -> bool:
-        """Whether nothing separates two messages but the turns of other tasks."""
-        return self._rate == math.inf and self._simulated is None and not self._paused and self._seek_target is None
+    def _publish_at_once(self, ahead: deque[RecordedMessage], due: int) -> None:
+        """Publish the next messages too, where nothing but a checkpoint would separate them from the last.
 
-    def _publish_at_once(self, messages: Iterator[RecordedMessage], until: int) -> None:
-        """Publish messages up to a log time (ns), for one turn of the event loop or as long as nothing stops it.
-
-        A checkpoint takes longer than a message. Without the limit, samples that other tasks wait for could leave the
-        windows of buffers before these tasks have their turn.
+        A checkpoint takes longer than a message. In simulated time these are the messages of the same log time (ns),
+        up to a number of samples, so that tasks see the same in each run. At an infinite rate they are the messages of
+        one turn of the event loop and of some time of the log: otherwise samples that other tasks wait for could leave
+        the windows of buffers before these tasks have their turn.
         """
-        budget = TurnBudget()
-        while not budget.spent and self._hurries and self._playhead is not None and self._playhead < until:
-            message = next(messages, None)
-            if message is None:
+        rate, simulated = self._rate, self._simulated is not None
+        if not simulated and rate < math.inf:
+            return
+        budget, until, samples = TurnBudget(), due if simulated else due + _STRETCH, 0
+        while ahead and ahead[0].received <= until:
+            # A subscriber may have said so.
+            if self._paused or self._rate != rate or self._seek_target is not None:
                 return
+            if samples >= _SAMPLES_AT_ONCE if simulated else budget.spent:
+                return
+            message = ahead.popleft()
+            samples += len(message.batch)
             self._playhead = message.received
             self._publish(message)
 
@@ -425,15 +430,17 @@ class Player:
             self._waiting = None
 
     def _publish(self, message: RecordedMessage) -> None:
-        self.position = message.received
-        self.messages += not message.is_report
-        self.bad.update(error.reason for error in message.errors)
-        if not message.batch:
+        received, batch, errors = message
+        self.position = received
+        self.messages += not (errors and message.is_report)
+        if errors:
+            self.bad.update(error.reason for error in errors)
+        if not batch:
             return
-        self.bus.publish(message.batch, invalid="drop")
-        self.played += len(message.batch)
+        self.bus.publish(batch, "drop")
+        self.played += len(batch)
         if self._simulated is None:
-            for sample in message.batch:
+            for sample in batch:
                 if sample.static:
                     self._moving_frames.pop(sample.child, None)
                 else:

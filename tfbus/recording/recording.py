@@ -356,8 +356,12 @@ class Recording:
         received, channel, payload = stored
         if isinstance(channel, MalformedMessageError):
             return RecordedMessage(received, (), (channel,))
+        decoder = self._decoders[channel]
+        plain = None if decoder.decode_plain is None else decoder.decode_plain(payload)
+        if plain is not None:
+            return RecordedMessage(received, plain, ())
         try:
-            samples, errors = self._decoders[channel].decode(payload)
+            samples, errors = decoder.decode(payload)
         except MalformedMessageError as error:
             # Its traceback would keep the payload.
             return RecordedMessage(received, (), (MalformedMessageError(error.reason, error.detail),))
