@@ -23,8 +23,8 @@ async def drive(bus: tfbus.Bus, name: str, radius: float, speed: float, start: i
     robot = tfbus.TransformBroadcaster(bus, authority=name, prefix=f"{name}/", shared=SHARED, invalid="drop")
     robot.send_static("base_link", "camera", tfbus.Transform(translation=(0.2, 0.0, 1.0)))
     robot.send_static("base_link", "gripper", tfbus.Transform(translation=(0.5, 0.0, 0.4)))
-    async for _ in bus.clock.ticks(50.0):
-        stamp = bus.clock.now()
+    async for tick in bus.clock.ticks(50.0):
+        stamp = start + tick * tfbus.SECOND // 50
         angle = speed * tfbus.to_seconds(stamp - start)
         place = (radius * math.cos(angle), radius * math.sin(angle), 0.0)
         pose = tfbus.Transform.from_xyz_rpy(place, (0.0, 0.0, angle + math.pi / 2))

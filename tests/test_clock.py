@@ -325,6 +325,13 @@ def test_ticks_start_at_the_first_iteration() -> None:
     assert watch.elapsed == 1_000 + 5 * SECOND
 
 
+def test_the_first_tick_is_0_however_much_time_passes_meanwhile() -> None:
+    watch = Watch()
+    readings = count(0, SECOND)
+    ticks = Ticks(10, lambda: next(readings), watch.sleep_until)
+    assert (now(ticks.__anext__()), ticks.skipped) == (0, 0)
+
+
 @given(
     hz=st.one_of(st.integers(1, 1_000), st.floats(0.01, 1_000.0)),
     busy=st.lists(st.integers(0, 30 * SECOND), max_size=30),

@@ -61,9 +61,10 @@ class Ticks:
         return self
 
     async def __anext__(self) -> int:
+        now = self._elapsed()
         if self._start is None:
-            self._start = self._elapsed()
-        newest_due = math.floor((self._elapsed() - self._start) * self.hz / SECOND)
+            self._start = now
+        newest_due = math.floor((now - self._start) * self.hz / SECOND)
         tick = max(self._next, newest_due)
         self.skipped += tick - self._next
         self._next = tick + 1

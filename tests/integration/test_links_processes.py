@@ -19,7 +19,7 @@ pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
 pytestmark = pytest.mark.thorough
 
 BACKENDS = ("asyncio", "trio", "asyncio+uvloop")
-SECONDS = 4
+SECONDS = 2
 BLOCKED = 3.0
 """The seconds for which a slow process does not return to its event loop."""
 RATE = 500 / 3
@@ -93,7 +93,7 @@ def test_a_ring_of_three_domains_brings_every_sample_once(processes: Crowd) -> N
     send_in_turn(members)
 
 
-@pytest.mark.parametrize("drop_lost", [False, True])
+@pytest.mark.parametrize(("place", "drop_lost"), [("local", False), ("router", True)], indirect=["place"])
 def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_and_for_late_joiners(
     drop_lost: bool, processes: Crowd, place: Place
 ) -> None:

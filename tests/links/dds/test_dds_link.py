@@ -88,19 +88,18 @@ async def test_messages_come_with_the_name_of_their_node(domain_number: int) -> 
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(("user_data", "named"), [(b"enclave=/robot;\0", True), (b"", False)])
 async def test_a_message_waits_for_the_name_of_its_node_only_a_while_and_longer_for_a_program_of_ros(
-    domain_number: int, user_data: bytes, named: bool
+    domain_number: int,
 ) -> None:
     async with joined(domain_number) as end:
-        with DdsNode(domain_number, user_data) as node:
+        with DdsNode(domain_number, b"enclave=/robot;\0") as node, DdsNode(domain_number) as other:
             node.say(static("map", "lidar"), topic="rt/tf_static")
-            await until(lambda: len(end.link.peers) == 1)
-            await anyio.sleep(1.5)
-            assert (end.heard == []) is named
+            await until(lambda: end.link.peers == (node.id,))
+            other.say(static("map", "camera"), topic="rt/tf_static")
+            await end.until_heard("camera")
             node.tell_name("/", "late")
-            await end.until_heard("lidar")
-            assert end.heard[0].authority == ("/late" if named else node.id)
+            await end.until_heard("camera", "lidar")
+    assert [sample.authority for sample in end.heard] == [other.id, "/late"]
 
 
 async def test_a_participant_is_a_peer_while_it_publishes_on_any_topic(domain_number: int) -> None:
