@@ -252,6 +252,9 @@ class Buffer:
             found: TransformStamped | None = await wait
             if found is None or self._live.last_reset is not last_reset:
                 wait.asked = Question(target, source, as_at(at))
+                if wait.names is None:
+                    # The kernel has not parked it.
+                    wait.since = self._clock.now()
                 return await self._lookups.go_on(wait, last_reset)
         except BaseException:
             self._lookups.end(wait)
@@ -505,6 +508,7 @@ class Buffer:
         """Leave the bus; waiting lookups end with `BusClosedError`. Buffered transforms can still be looked up."""
         self.bus._detach(self._live)
         self._live.end("the buffer is closed")
+        self._lookups.close()
         self._live.call_end_callbacks()
 
     def __repr__(self) -> str:
