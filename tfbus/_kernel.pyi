@@ -3,7 +3,7 @@
 `Feed`, `Intake` and `Method` have no twin: without the compiled kernel the ordinary way runs; see `tfbus.which_kernel`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 Vector = tuple[float, float, float]
@@ -84,6 +84,7 @@ class Paths:
     recent: dict[str, dict[str, Chain]]
     inserted: int
     now: Any
+    qualified: Any
     version: int
     def __init__(self, lock: Any, latest: object, kind: type[Sample], /) -> None: ...
     def answer(self, target: str, source: str, at: object, /) -> Any: ...
@@ -149,7 +150,15 @@ class Intake:
     open: bool
     samples: int
     thread: int
-    def __init__(self, judge: Judge, kind: type[Sample], listeners: tuple[Any, ...], /) -> None: ...
+    def __init__(
+        self,
+        judge: Judge,
+        kind: type[Sample],
+        tell: Callable[[Any], object],
+        listeners: tuple[Any, ...],
+        busy: tuple[Any, ...],
+        /,
+    ) -> None: ...
     def take(self, samples: object, invalid: object, /) -> bool | None: ...
 
 class Method:

@@ -739,10 +739,12 @@ class Paths:
     version : int
         A number that differs after each change.
     now : callable or None
-        The clock that ages are counted from, which gives a stamp in ns. Only the compiled kernel asks it.
+        The clock that ages are counted from, which gives a stamp in ns.
+    qualified : type or None
+        The class of an answer with a policy. Only the compiled kernel gives such answers, and answers by age.
     """
 
-    __slots__ = ("_changes", "_kind", "_latest", "_lock", "inserted", "now", "recent")
+    __slots__ = ("_changes", "_kind", "_latest", "_lock", "inserted", "now", "qualified", "recent")
 
     def __init__(self, lock: AbstractContextManager[Any], latest: Latest, kind: Any) -> None:
         self._lock = lock
@@ -751,6 +753,7 @@ class Paths:
         self.recent: dict[str, dict[str, Chain]] = {}
         self.inserted = 0
         self.now: Any = None
+        self.qualified: Any = None
         self._changes = 0
 
     @property

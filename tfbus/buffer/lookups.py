@@ -25,7 +25,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from heapq import heapify, heappop, heappush
-from itertools import count, islice
+from itertools import count
 from typing import Any, Protocol, cast
 
 from tfbus._aio.loops import asleep, checkpoint, running_loop, wake_up
@@ -47,7 +47,7 @@ from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_duration, from
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.history import Edge
 from tfbus.tree.lookup import Bounds, Question, answer
-from tfbus.waiting.live_tree import LiveTree, PendingLookup, Waiter, without_traceback
+from tfbus.waiting.live_tree import PendingLookup, Share, Waiter, without_traceback
 
 
 class LoopTimer:
@@ -267,17 +267,14 @@ class HangingReport:
 
     Parameters
     ----------
-    parked : dict of Waiter to None
-        All that wait.
+    share : Share
     clock : Clock
     blocker : callable
         Gives the error that blocks a waiter; None if it has found its answer.
     """
 
-    def __init__(
-        self, parked: dict[Waiter, None], clock: Clock, blocker: Callable[[Waiter], TransformLookupError | None]
-    ) -> None:
-        self._parked = parked
+    def __init__(self, share: Share, clock: Clock, blocker: Callable[[Waiter], TransformLookupError | None]) -> None:
+        self._share = share
         self._clock = clock
         self._blocker = blocker
         self._told = SeenKeys(_LOOKED_AT)
@@ -297,7 +294,7 @@ class HangingReport:
         named: list[PendingLookup] = []
         unnamed = 0
         first = math.inf
-        for waiter in islice(self._parked, _LOOKED_AT):
+        for waiter in self._share.waiters[:_LOOKED_AT]:
             pause = REPORT_AFTER - to_seconds(now - waiter.since)
             if waiter.patience <= REPORT_AFTER or waiter.cause in self._told:
                 continue
@@ -350,32 +347,42 @@ class Lookups:
 
     Parameters
     ----------
-    live : LiveTree
+    share : Share
+        The buffer's share of the live tree.
     bus : Bus
         Its clock measures timeouts and ages; it says which thread may wait here.
     local_names : LocalNames, optional
         Translates the answers. Questions, errors and log lines have the names of the bus.
+
+    Attributes
+    ----------
+    forest : Forest
+        The forest that answers.
+    feed : Feed or None
+        Asks for this buffer, and parks its lookups; only the compiled kernel has one.
     """
 
     def __init__(
         self,
-        live: LiveTree,
+        share: Share,
         bus: Bus,
         local_names: LocalNames | None = None,
     ) -> None:
-        self.live = live
+        self.share = share
+        self.forest = share.live.forest
         self.bus = bus
         self._clock = bus.clock
         self._now = bus.clock.now
         self._is_here = bus._is_here
         self._local_names = local_names
         self._alarms = alarms_of(bus.clock)
-        self._report = HangingReport(live.waiting.parked, bus.clock, self.blocker)
+        self._report = HangingReport(share, bus.clock, self.blocker)
         # The loop on which the next look at the lookups that hang is due, if one is, and the function that cancels it.
         self._looking_on: Any = None
         self._cancel_look: Cancel = _nothing
-        if live.feed is not None:
-            live.feed.kind, live.feed.begin = Wait, self.begin
+        self.feed = share.live.make_feed()
+        if self.feed is not None:
+            self.feed.kind, self.feed.begin = Wait, self.begin
 
     @property
     def has_alarms(self) -> bool:
@@ -401,14 +408,14 @@ class Lookups:
         """The answer, or an error at once."""
         bounds = None
         if question.is_plain:
-            plain = self.live.forest.paths.answer(question.target, question.source, question.at)
+            plain = self.forest.paths.answer(question.target, question.source, question.at)
             if plain is not None:
                 return plain if self._local_names is None else self._local_names.answer(plain)
         if question.max_age is not None:
             bounds = self.bounds(question.max_age, question.at, question.source_at)
         try:
             found = answer(
-                self.live.forest,
+                self.forest,
                 question.target,
                 question.source,
                 question.at,
@@ -430,10 +437,10 @@ class Lookups:
         `others` are further questions that need an answer: if waiting cannot help one of them, its error is raised.
         """
         patience = math.inf if timeout is None else as_duration(timeout, "timeout")
-        last_reset = self.live.last_reset
+        last_reset = self.share.live.last_reset
         await checkpoint()
         wait = Wait(question, self._now(), _nothing)
-        wait.others, wait.patience = others, patience
+        wait.share, wait.others, wait.patience = self.share, others, patience
         return await self.go_on(wait, last_reset)
 
     async def go_on(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:
@@ -443,7 +450,7 @@ class Lookups:
         """
         if self._alarms is None:
             return await self._wait_in_scopes(wait, last_reset)
-        waiting, paths = self.live.waiting, self.live.forest.paths
+        waiting, paths = self.share.live.waiting, self.forest.paths
         try:
             while True:
                 waiting.remove(wait)
@@ -463,8 +470,9 @@ class Lookups:
 
     def begin(self, wait: Wait, on_asyncio: bool) -> Generator[Any, None, None] | None:
         """The sleep of a lookup that the kernel is about to park; None if it must not. Called by the kernel."""
-        if self.live.end_reason is not None or wait.patience == 0.0:
+        if self.share.end_reason is not None or wait.patience == 0.0:
             return None
+        wait.share = self.share
         if on_asyncio:
             # As `wake_up`, which takes twice as long to call.
             loop = get_running_loop()
@@ -486,7 +494,7 @@ class Lookups:
 
     def end(self, wait: Wait) -> None:
         """Leave nothing of a wait behind."""
-        self.live.waiting.remove(wait)
+        self.share.live.waiting.remove(wait)
         if wait.cancel_end is not None:
             wait.cancel_end()
 
@@ -496,8 +504,7 @@ class Lookups:
 
     def pending(self, most: int | None = None) -> Iterator[PendingLookup]:
         """All waiting lookups, or the first few, with the errors that block them. For any thread."""
-        # Copied first, because the loop may park and wake meanwhile.
-        for waiter in list(self.live.waiting.parked)[:most]:
+        for waiter in self.share.waiters[:most]:
             if (blocker := self.blocker(waiter)) is not None:
                 yield PendingLookup(waiter.question, waiter.since, blocker)
 
@@ -518,15 +525,15 @@ class Lookups:
         found = self._look(wait, last_reset)
         if found is None and wait.blocked_by is not None:
             self.bus._check_thread()
-            if self.live.end_reason is not None:
-                raise BusClosedError(self.live.end_reason) from wait.blocked_by
+            if self.share.end_reason is not None:
+                raise BusClosedError(self.share.end_reason) from wait.blocked_by
             wait.sleep = self._fall_asleep(wait)
-            self.live.park(wait, wait.blocked_by)
+            self.share.park(wait, wait.blocked_by)
         return found
 
     def _look(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped | None:
         """The answer; or None, after noting the error that blocks it."""
-        latest = self.live.last_reset
+        latest = self.share.live.last_reset
         if latest is not None and latest is not last_reset:
             raise ClockResetError(before=latest.before, after=latest.after)
         try:
@@ -586,7 +593,7 @@ class Lookups:
                         try:
                             await asleep(wait.sleep)
                         finally:
-                            self.live.waiting.remove(wait)
+                            self.share.live.waiting.remove(wait)
                         found = self._ask(wait, last_reset)
                 if found is None:
                     found = self._ask(wait, last_reset)
@@ -597,4 +604,4 @@ class Lookups:
         """Raise `UnknownFrameError` for a name that can never be the name of a frame."""
         for name in (question.target, question.source, question.fixed):
             if name is not None and not is_frame(name):
-                raise UnknownFrameError(frame=name, known=self.live.forest.some_frames()) from None
+                raise UnknownFrameError(frame=name, known=self.forest.some_frames()) from None

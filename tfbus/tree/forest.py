@@ -17,6 +17,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager
 from itertools import chain, islice
 from typing import Any, NamedTuple, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +30,7 @@ from tfbus.errors import (
     UnknownFrameError,
     error_of,
 )
-from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.geometry.stamped import Batch, QualifiedTransform, TransformStamped
 from tfbus.rows import IDENTITY, Row, compose, invert
 from tfbus.stamps import LATEST, STAMP_MIN, Latest, as_stamp
 from tfbus.tree.cycles import Frames, Loop, admit, edges_above, names_below, past_loop
@@ -189,11 +190,12 @@ class Path(Chain):
             If an edge does not cover it.
         """
         row = self.row(at)
-        if row is None:
-            row = _climb(self.up, at)
-            if self.down:
-                row = compose(invert(_climb(self.down, at)), row)
-        return row
+        return self.product(lambda edge: edge.row_at(at)) if row is None else row
+
+    def product(self, row_of: Callable[[FrameHistory], Row]) -> Row:
+        """The row of source in target by the row of each moving edge, step by step."""
+        row = _climb(self.up, row_of)
+        return compose(invert(_climb(self.down, row_of)), row) if self.down else row
 
     def newest_common(self) -> tuple[int, FrameHistory]:
         """The newest stamp that every moving edge has reached, and the edge that lags most.
@@ -234,11 +236,11 @@ class Path(Chain):
         return error
 
 
-def _climb(steps: tuple[Step, ...], at: int) -> Row:
-    """The first step's child, seen from the last step's parent, at a stamp."""
+def _climb(steps: tuple[Step, ...], row_of: Callable[[FrameHistory], Row]) -> Row:
+    """The first step's child, seen from the last step's parent."""
     row: Row | None = None
     for step in steps:
-        here = step.row_at(at) if isinstance(step, FrameHistory) else step
+        here = row_of(step) if isinstance(step, FrameHistory) else step
         row = here if row is None else compose(here, row)
     return IDENTITY if row is None else row
 
@@ -412,10 +414,11 @@ class PathCache(Paths):
         The lock of the forest.
     """
 
-    __slots__ = ("_count", "_older")
+    __slots__ = ("__weakref__", "_count", "_older")
 
     def __init__(self, lock: AbstractContextManager[Any]) -> None:
         super().__init__(lock, LATEST, TransformStamped)
+        self.qualified = QualifiedTransform
         self._count = 0
         self._older: dict[str, dict[str, Path]] = {}
 
@@ -473,8 +476,8 @@ class LoopingSample(NamedTuple):
 class Forest:
     """The histories of all frames that have a parent.
 
-    `insert`, `commit`, `remove`, `clear`, `search`, `keep_locally`, `known_frames`, `some_frames`, `read_all`, `copy`
-    and `copy_within` take the lock themselves. The caller of every other method holds it.
+    `insert`, `commit`, `remove`, `clear`, `search`, `local_paths`, `keep_locally`, `known_frames`, `some_frames`,
+    `read_all`, `copy` and `copy_within` take the lock themselves. The caller of every other method holds it.
 
     Parameters
     ----------
@@ -491,8 +494,6 @@ class Forest:
     names : KnownFrames
     paths : PathCache
         The newest paths that have been found and are permanent. A change that could make one wrong empties it.
-    local_paths : PathCache
-        Some of the `paths` under other names, which `keep_locally` has given them; it is emptied with them.
     changing_paths : dict of (target, source) to Path
         The newest paths that have been found and are not permanent.
     changed : set of str
@@ -520,7 +521,7 @@ class Forest:
         self.frames: dict[str, FrameHistory] = {}
         self.names = KnownFrames()
         self.paths = PathCache(self.lock)
-        self.local_paths = PathCache(self.lock)
+        self._local_paths: WeakSet[PathCache] = WeakSet()
         self.changing_paths: dict[tuple[str, str], Path] = {}
         self.changed: set[str] = set()
         self.new_parents: set[str] = set()
@@ -702,10 +703,11 @@ class Forest:
         self.expired_samples.clear()
 
     def forget_paths(self) -> None:
-        """Empty `paths`, `local_paths` and `changing_paths`."""
+        """Empty `paths`, the caches of `local_paths` and `changing_paths`."""
         self.structure += 1
         self.paths.clear()
-        self.local_paths.clear()
+        for local in self._local_paths:
+            local.clear()
         self.changing_paths.clear()
 
     # Questions
@@ -775,14 +777,21 @@ class Forest:
                 self.changing_paths.clear()
             self.changing_paths[target, source] = path
 
-    def keep_locally(self, local: tuple[str, str], target: str, source: str) -> None:
-        """Keep a path that was found under local names of its two ends as well. Takes the lock."""
-        if self.local_paths.holds(*local):
+    def local_paths(self) -> PathCache:
+        """A new cache for `keep_locally`; it is emptied with `paths`."""
+        local = PathCache(self.lock)
+        with self.lock:
+            self._local_paths.add(local)
+        return local
+
+    def keep_locally(self, paths: PathCache, local: tuple[str, str], target: str, source: str) -> None:
+        """Keep a path that was found in a cache of `local_paths`, under local names of its ends. Takes the lock."""
+        if paths.holds(*local):
             return
         with self.lock:
             path = self.paths.find(target, source)
             if path is not None:
-                self.local_paths.keep(*local, path)
+                paths.keep(*local, path)
 
     def known_frames(self) -> tuple[str, ...]:
         """Every frame that a sample names, sorted. Takes the lock."""

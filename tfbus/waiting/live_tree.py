@@ -1,5 +1,16 @@
 """A forest that a bus fills, with the lookups that wait for it and the watches that follow it.
 
+Buffers of one bus that would hold the same samples share one `LiveTree`, each by a `Share`, so a sample is stored and
+looked up among the waiting once for all of them::
+
+    Bus ──batch──> LiveTree ── forest, waiting, watching
+                      │
+                      ├── Share of buffer 1 ── its waiters and watches, its end
+                      └── Share of buffer 2 ── ...
+
+A buffer that is closed keeps what it has. While others go on sharing the tree, the next change first gives the closed
+ones that still exist a copy of the forest, one for all that were closed since the last change.
+
 A lookup that cannot be answered is parked under the frame that blocks it, and an insertion looks only there:
 
 * under an edge whose newest stamp is too old, in the order of the stamps that the lookups need. The batch that brings
@@ -21,7 +32,9 @@ from bisect import bisect_left, insort
 from collections.abc import Callable, Container, Hashable, Iterable, KeysView
 from dataclasses import dataclass
 from itertools import count, takewhile
-from typing import Any
+from operator import sub
+from typing import Any, NamedTuple, Protocol
+from weakref import ref
 
 from tfbus._python_kernel import Place
 from tfbus.errors import (
@@ -149,6 +162,8 @@ class Waiter(Parked):
     ----------
     others : tuple of Question
         Further questions that need an answer: the waiter is woken when one of them can no longer have an answer.
+    share : Share or None
+        The share of the buffer that asks.
     patience : float
         How long it waits at most, in s.
     blocked_by : TransformLookupError or None
@@ -160,6 +175,7 @@ class Waiter(Parked):
     """
 
     others: tuple[Question, ...] = ()
+    share: "Share | None" = None
     patience = math.inf
     blocked_by: TransformLookupError | None = None
     limits: list[tuple[str, Place]] | None = None
@@ -218,7 +234,7 @@ def without_traceback(error: TransformLookupError) -> TransformLookupError:
 
 
 class WaitingIndex:
-    """The parked lookups of one buffer.
+    """The parked lookups of all buffers that share a tree.
 
     Attributes
     ----------
@@ -434,6 +450,11 @@ class WaitingIndex:
         if not (blocked.places or blocked.for_any or blocked.limits):
             self.by_frame.pop(frame, None)
 
+    def of(self, share: "Share") -> list[Waiter]:
+        """The waiters of one buffer; for any thread."""
+        # Copied first, because another thread may call this while the loop parks and wakes.
+        return [waiter for waiter in list(self.parked) if waiter.share is share]
+
 
 def _discard(places: list[Place], place: Place) -> None:
     """Remove a place from a sorted list, if it is in it."""
@@ -442,8 +463,20 @@ def _discard(places: list[Place], place: Place) -> None:
         del places[i]
 
 
+class Counters(NamedTuple):
+    """The samples that a bus has published, and those of one tree, as `BufferStatistics` explains them."""
+
+    offered: int
+    inserted: int = 0
+    replaced: int = 0
+    expired: int = 0
+    expired_ahead: int = 0
+    superseded: int = 0
+    looped: int = 0
+
+
 class LiveTree:
-    """The part of a buffer that its bus calls.
+    """The part of one or several buffers that their bus calls.
 
     Parameters
     ----------
@@ -457,8 +490,6 @@ class LiveTree:
     forest : Forest
     waiting : WaitingIndex
     watching : WatchIndex
-    end_reason : str or None
-        The reason why no more samples will come; None while they may.
     last_reset : ClockResetError or None
         The last jump back of the clock; a new object for each.
     tell_expired : callable
@@ -475,27 +506,31 @@ class LiveTree:
         self._on_loop = on_loop
         self.waiting = WaitingIndex()
         self.watching = WatchIndex()
-        self.end_reason: str | None = None
         self.last_reset: ClockResetError | None = None
         self.tell_expired: Callable[[TransformStamped, int, str], bool] = lambda _sample, _newest, _authority: False
         self.expired_ahead = 0
         self.superseded = 0
         self._waiters = self.waiting.by_frame
         self._watches = self.watching.by_frame
-        self._end_callbacks: dict[Registration, Callable[[], object]] = {}
-        waiting = self.waiting
-        self.feed: Any = None
-        if Feed is not None:
-            self.feed = Feed(
-                forest.paths,
-                forest.frames,
-                forest.readers,
-                waiting.by_frame,
-                waiting.parked,
-                waiting.limits,
-                self.watching.by_frame,
-                waiting,
-            )
+        # What still reads the forest for a buffer that was closed since the last change.
+        self._closed: list[ref[ReadsForest]] = []
+        self.feed = self.make_feed()
+
+    def make_feed(self) -> Any:
+        """A `Feed` of this tree; None without the compiled kernel."""
+        if Feed is None:
+            return None
+        forest, waiting = self.forest, self.waiting
+        return Feed(
+            forest.paths,
+            forest.frames,
+            forest.readers,
+            waiting.by_frame,
+            waiting.parked,
+            waiting.limits,
+            self.watching.by_frame,
+            waiting,
+        )
 
     def insert(self, batch: Batch) -> None:
         """Insert a batch that the bus has judged, and wake the lookups and watches that it concerns."""
@@ -504,6 +539,7 @@ class LiveTree:
 
     def insert_closely(self, batch: Batch) -> None:
         """As `insert`, for a batch that the feed has handed back because it is not plain."""
+        self._part()
         waiters = self._waiters
         plain = self.forest.commit(batch)
         if waiters or self.waiting.limits:
@@ -539,6 +575,7 @@ class LiveTree:
 
     def remove_frame(self, frame: str) -> None:
         """Forget a frame, if it is known, and wake the lookups and watches that it concerns."""
+        self._part()
         forest = self.forest
         parents = forest.frames[frame].named_parents if frame in forest.frames else ()
         try:
@@ -552,55 +589,39 @@ class LiveTree:
 
     def reset(self, before: int, after: int) -> None:
         """Drop moving samples after the clock has jumped back; waiting lookups and watches get a `ClockResetError`."""
+        self._part()
         self.forest.clear()
         self.last_reset = ClockResetError(before=before, after=after)
         _wake(self.waiting.pop_all())
         _wake(self.watching.reset(self.last_reset))
 
-    def end(self, reason: str) -> None:
-        """Wake all waiting lookups and watches for the last time; only the first reason counts."""
-        if self.end_reason is None:
-            self.end_reason = reason
-        _wake(self.waiting.pop_all())
-        _wake(self.watching.end())
-
-    def call_end_callbacks(self) -> None:
-        """Call each function that `on_end` registered, once. An `Exception` of one is logged."""
-        while self._end_callbacks:
-            registration = next(iter(self._end_callbacks))
-            callback = self._end_callbacks.pop(registration)
-            try:
-                callback()
-            except Exception as error:
-                logging.getLogger("tfbus").warning("a callback at the end of a buffer raised", exc_info=error)
-
-    def on_end(self, callback: Callable[[], object]) -> Registration:
-        """Register a function for `call_end_callbacks`, or call it now if the end has come."""
-        registration = Registration(lambda: self._end_callbacks.pop(registration, None))
-        if self.end_reason is not None:
-            callback()
-        else:
-            self._end_callbacks[registration] = callback
-        return registration
-
-    @property
-    def has_waiters(self) -> bool:
-        """Whether a task or a callback has to be told of the end, which only the thread of the event loop may do."""
-        return len(self.waiting) > 0 or self.watching.has_waiters or bool(self._end_callbacks)
-
-    def statistics(self, offered: int) -> BufferStatistics:
-        """The counters, with the number of samples that the bus has offered."""
-        forest = self.forest
-        return BufferStatistics(
-            offered,
-            forest.inserted,
-            forest.replaced,
-            forest.expired + self.superseded,
-            len(self.waiting),
-            self.expired_ahead,
-            self.superseded,
-            forest.looped,
+    def counters(self, samples: int) -> Counters:
+        """The counters now, given the number of samples that the bus has published."""
+        forest, superseded = self.forest, self.superseded
+        expired = forest.expired + superseded
+        return Counters(
+            samples, forest.inserted, forest.replaced, expired, self.expired_ahead, superseded, forest.looped
         )
+
+    def keep_for(self, *readers: "ReadsForest") -> None:
+        """Let what a closed buffer reads stay as it is now, while other buffers share this tree."""
+        self._closed += map(ref, readers)
+        # As for any reader, the kernel then hands the next batch back.
+        self.forest.readers[id(self)] = set()
+
+    def _part(self) -> None:
+        """Before a change, give the buffers that were closed a forest of their own."""
+        if not self._closed:
+            return
+        self.forest.readers.pop(id(self), None)
+        readers = [reader for known in self._closed if (reader := known()) is not None]
+        self._closed.clear()
+        if readers:
+            forest, before = self.forest.copy(), self.forest
+            forest.inserted, forest.replaced = before.inserted, before.replaced
+            forest.expired, forest.looped = before.expired, before.looped
+            for reader in readers:
+                reader._stand_on(forest)
 
     def _wake_with_answers(self, waiters: Iterable[Waiter]) -> None:
         """Wake waiters, each with its answer if the kernel has one; it counts as long as the forest stays as it is."""
@@ -645,6 +666,91 @@ class LiveTree:
             for found in forest.looping:
                 self._on_loop(found)
         forest.forget_changes()
+
+
+class ReadsForest(Protocol):
+    """A reader of a forest, such as a buffer."""
+
+    def _stand_on(self, forest: Forest) -> None:
+        """Read this forest from now on."""
+
+
+class Share:
+    """The part of a live tree that belongs to one buffer: the lookups and watches of this buffer, and its end.
+
+    Parameters
+    ----------
+    live : LiveTree
+    before : Counters
+        The counters of the bus and of the tree before the buffer joined; its own go on from there.
+
+    Attributes
+    ----------
+    live : LiveTree
+    end_reason : str or None
+        The reason why no more samples will come; None while they may.
+    """
+
+    def __init__(self, live: LiveTree, before: Counters) -> None:
+        self.live = live
+        self.end_reason: str | None = None
+        self._end_callbacks: dict[Registration, Callable[[], object]] = {}
+        self._before = before
+
+    def park(self, waiter: Waiter, error: TransformLookupError) -> None:
+        """See `LiveTree.park`."""
+        waiter.share = self
+        self.live.park(waiter, error)
+
+    def watch(self, state: WatchState) -> None:
+        """Add a watch without an answer."""
+        state.share = self
+        self.live.watching.add(state)
+
+    @property
+    def waiters(self) -> list[Waiter]:
+        """The waiting lookups; for any thread."""
+        return self.live.waiting.of(self)
+
+    def end(self, reason: str) -> None:
+        """Wake the waiting lookups and watches for the last time; only the first reason counts."""
+        if self.end_reason is None:
+            self.end_reason = reason
+        waiters = self.waiters
+        for waiter in waiters:
+            self.live.waiting.remove(waiter)
+        _wake(waiters)
+        _wake(self.live.watching.end(self))
+
+    def call_end_callbacks(self) -> None:
+        """Call each function that `on_end` registered, once. An `Exception` of one is logged."""
+        while self._end_callbacks:
+            registration = next(iter(self._end_callbacks))
+            callback = self._end_callbacks.pop(registration)
+            try:
+                callback()
+            except Exception as error:
+                logging.getLogger("tfbus").warning("a callback at the end of a buffer raised", exc_info=error)
+
+    def on_end(self, callback: Callable[[], object]) -> Registration:
+        """Register a function for `call_end_callbacks`, or call it now if the end has come."""
+        registration = Registration(lambda: self._end_callbacks.pop(registration, None))
+        if self.end_reason is not None:
+            callback()
+        else:
+            self._end_callbacks[registration] = callback
+        return registration
+
+    @property
+    def has_waiters(self) -> bool:
+        """Whether a task or a callback has to be told of the end, which only the thread of the event loop may do."""
+        return bool(self._end_callbacks) or bool(self.waiters) or self.live.watching.has_waiters(self)
+
+    def statistics(self, samples: int) -> BufferStatistics:
+        """The counters since the buffer joined, given the number of samples that its bus has published by now."""
+        offered, inserted, replaced, expired, *others = map(sub, self.live.counters(samples), self._before)
+        waiting = len(self.waiters)
+        return BufferStatistics(offered, inserted, replaced, expired, waiting, *others)
 
 
 def _wake(waiters: Iterable[Waiter | WatchState]) -> None:
