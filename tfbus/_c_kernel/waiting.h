@@ -3,16 +3,16 @@
  * A Parked is one waiting lookup. A Line is the lookups under one frame; its `places` are sorted so that the next one due
  * is the last. A Feed is the plain way into and out of the waiting lookups of one buffer.
  *
- * `ask` gives a Parked to be awaited: a turn of the loop, then the answer, or a wait for the insertion that brings it. The
- * event loop is Python's: `begin` makes the wake-up, notes the time and sets the alarms, and gives the iterator that
- * sleeps. The result is None where the question is not plain, or the answer did not hold until the task ran; then a
- * coroutine in Python goes on. It awaits the Parked, so an exception (a cancellation) is thrown into that coroutine, which
- * removes the Parked from the index; there is no `throw` here.
- * `park` puts a lookup in the line of the edge that lags most, if newer samples are all that it lacks. It makes no error,
- * which says the same in words and takes many times as long: Python words it when somebody asks what blocks the lookup.
+ * `ask` gives a Parked to be awaited: a turn of the loop, then the answer, or a sleep until an insertion brings it. It is
+ * parked in the line of the edge that lags most if newer samples are all that it lacks; no error says so, because Python
+ * words that when somebody asks. The event loop is Python's: `begin` makes the wake-up, notes the time, sets the alarms,
+ * and gives the iterator that sleeps. The result is None where the question is not plain, or the answer did not hold until
+ * the task ran; then the coroutine that awaits the Parked goes on. An exception (a cancellation) is thrown into that
+ * coroutine, and it takes the Parked out of the index: there is no `throw` here.
+ *
  * `insert` stores a batch, pops from the lines of its frames whoever is due, and calls `wake` with the answer already
  * found, if that is plain. It takes a batch only if the lines need nothing else: nobody waits for any sample, no limit is
- * passed, and nobody watches the frames. Where one of the two does nothing, Python parks, or inserts and wakes.
+ * passed, and nobody watches the frames. Else it does nothing, and Python inserts and wakes.
  *
  * Calling `wake` runs Python code, which may change everything here. So a waiter leaves its line before it is called,
  * and nothing is remembered across the call but references of our own.

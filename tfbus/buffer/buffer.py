@@ -266,6 +266,9 @@ class Buffer:
             found: TransformStamped | None = await wait
             if found is None or self._share.live.last_reset is not last_reset:
                 wait.asked = Question(target, source, as_at(at))
+                if wait.names is None:
+                    # The kernel has not parked it.
+                    wait.since = self._clock.now()
                 return await self._lookups.go_on(wait, last_reset)
         except BaseException:
             self._lookups.end(wait)
@@ -520,6 +523,7 @@ class Buffer:
         if self.bus._detach(self._share):
             self._share.live.keep_for(self, self._tree)
         self._share.end("the buffer is closed")
+        self._lookups.close()
         self._share.call_end_callbacks()
 
     def __repr__(self) -> str:

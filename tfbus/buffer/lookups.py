@@ -1,14 +1,19 @@
 """Lookups that wait: parked under the frames that they lack, and woken by new samples.
 
-`Lookups.lookup` is the whole wait. It passes a checkpoint, asks the tree, and if the answer may still come it parks a
-`Waiter` in the live tree (`tfbus.waiting.live_tree` says under which frame) and awaits its wake-up. The insertion that
-unblocks the lookup hands over the answer. The task gives that answer if the tree has not changed until it runs, one
-turn of the event loop later; otherwise it asks again, and may park again on the same deadline.
+Each lookup passes a checkpoint, asks the tree, and if the answer may still come it is parked in the live tree
+(`tfbus.waiting.live_tree` says under which frame) and sleeps. The insertion that unblocks the lookup hands over the
+answer. The task gives that answer if the tree has not changed until it runs, one turn of the event loop later;
+otherwise it asks again, and may park again on the same deadline.
+
+The kernel does all this for a plain lookup that lacks nothing but newer samples. It calls `Lookups.begin` for the
+sleep, because the event loop and the clock are Python's, and gives None where something is not plain. `Lookups.go_on`
+is the whole wait in Python. It goes on from there, and it is the only way without the compiled kernel, with a prefix,
+with options, and on a clock that is not a class of tfbus.
 
 An alarm ends a wait at its timeout. A cancel scope for each wait would set and remove a timer of the event loop each
 time; the alarms of a buffer share one timer. The timer is set for the first alarm. When that alarm is cancelled, the
-timer stays, because the next alarm is nearly always later. A lookup that has waited for 5 s is logged, together with
-all others that have.
+timer stays, because the next alarm is nearly always later. One further alarm, set while lookups wait, looks for all
+that have waited for 5 s and logs them. The error that blocks a lookup is worded only then, or when somebody asks.
 """
 
 import logging
@@ -431,12 +436,11 @@ class Lookups:
 
         `others` are further questions that need an answer: if waiting cannot help one of them, its error is raised.
         """
-        wait = Wait(question, 0, _nothing)
-        wait.share, wait.others = self.share, others
-        if timeout is not None:
-            wait.patience = as_duration(timeout, "timeout")
+        patience = math.inf if timeout is None else as_duration(timeout, "timeout")
         last_reset = self.share.live.last_reset
         await checkpoint()
+        wait = Wait(question, self._now(), _nothing)
+        wait.share, wait.others, wait.patience = self.share, others, patience
         return await self.go_on(wait, last_reset)
 
     async def go_on(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:
@@ -444,7 +448,6 @@ class Lookups:
 
         Every jump back of the clock after `last_reset` ends it.
         """
-        wait.since = wait.since or self._clock.now()
         if self._alarms is None:
             return await self._wait_in_scopes(wait, last_reset)
         waiting, paths = self.share.live.waiting, self.forest.paths
@@ -494,6 +497,10 @@ class Lookups:
         self.share.live.waiting.remove(wait)
         if wait.cancel_end is not None:
             wait.cancel_end()
+
+    def close(self) -> None:
+        """Look no more at the lookups that hang."""
+        self._look_after(math.inf)
 
     def pending(self, most: int | None = None) -> Iterator[PendingLookup]:
         """All waiting lookups, or the first few, with the errors that block them. For any thread."""
