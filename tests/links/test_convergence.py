@@ -14,7 +14,7 @@ from tfbus.links.message import Kind
 
 NAMES = [f"static{k}" for k in range(5)]
 LIMIT = 10.0
-SEEDS = int(os.environ.get("CONVERGENCE_SEEDS", "100"))
+SEEDS = int(os.environ.get("CONVERGENCE_SEEDS", "40"))
 
 
 def few_or_many(few: int, many: int) -> pytest.MarkDecorator:

@@ -80,7 +80,6 @@ async def raw(network: MemoryNetwork) -> tuple[MemoryWire, list[Any]]:
     return wire, items
 
 
-@pytest.mark.every_loop
 async def test_what_is_said_in_one_turn_goes_out_in_one_message_and_is_heard_batch_by_batch() -> None:
     network = MemoryNetwork()
     with Bus() as here, Bus() as there:
