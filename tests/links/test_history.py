@@ -80,14 +80,29 @@ def test_the_past_is_that_of_the_buffer_which_holds_most_of_it(keeps: tuple[floa
 
 
 def test_without_a_buffer_there_or_the_wish_here_only_the_newest_comes() -> None:
-    world, network, teller, buffer = scene()
-    teller.say(moving("map", "base", SECOND), moving("map", "base", 2 * SECOND))
-    wishless = world.process(network)
-    world.run(5.0)
-    buffer.close()
-    late = world.process(network, history=5.0)
-    world.run(5.0)
-    assert stamps_of(wishless.seen, "base") == stamps_of(late.seen, "base") == [2]
+    # Whichever peer answers first.
+    for seed in range(10):
+        world, network, teller, buffer = scene(seed=seed)
+        teller.say(moving("map", "base", SECOND), moving("map", "base", 2 * SECOND))
+        wishless = world.process(network)
+        world.run(5.0)
+        buffer.close()
+        late = world.process(network, history=5.0)
+        world.run(5.0)
+        assert stamps_of(wishless.seen, "base") == stamps_of(late.seen, "base") == [2]
+
+
+def test_of_a_killed_process_nobody_tells_the_past_and_its_newest_samples_stay() -> None:
+    for seed in range(10):
+        world, network, teller, _ = scene(seed=seed)
+        for _ in range(2):
+            world.process(network)
+        teller.say(moving("map", "base", SECOND), moving("map", "base", 2 * SECOND))
+        world.run(1.0)
+        world.kill(teller)
+        late = world.process(network, history=5.0)
+        world.run(5.0)
+        assert stamps_of(late.seen, "base") == [2]
 
 
 def test_what_a_link_has_heard_itself_it_does_not_tell_as_its_past() -> None:

@@ -582,15 +582,16 @@ class DomainEnd(Endpoint):
         self.relay.reach_changed(self)
         if self.drop_lost:
             self.relay.withdraw(self.relay.frames_of(lost), lost)
-            self._show(peer, set(opened))
+            if opened:
+                self._show(peer, set(opened))
 
-    def _show(self, peer: Peer, buses: Collection[bytes]) -> None:
-        """Publish the entries of buses that are reached again."""
+    def _show(self, peer: Peer, buses: Collection[bytes] | None = None) -> None:
+        """Publish the entries of some buses that are reached again, or of all."""
         batches = [
             (Provenance(entry.origin, entry.number, self, peer), [entry.sample])
-            for replica in (self._replicas.values() if buses else ())
+            for replica in self._replicas.values()
             for entry in replica.entries.values()
-            if entry.origin in buses and isinstance(entry.sample, ReceivedTransform)
+            if (buses is None or entry.origin in buses) and isinstance(entry.sample, ReceivedTransform)
         ]
         self._publish(peer, batches, live=False)
 
@@ -655,8 +656,9 @@ class DomainEnd(Endpoint):
         if peer in self._history.open:
             held = self._history.end(peer)
             if known is not None:
-                # Without an answer, the newest samples of the peer were not published yet.
-                self._show(known, set(known.paths))
+                if not self._history.open:
+                    # The newest samples of frames without a past were not published yet.
+                    self._show(known)
                 for heard in held:
                     self._take_held(known, heard)
 

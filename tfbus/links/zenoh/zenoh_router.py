@@ -11,6 +11,7 @@ import zenoh
 
 from tfbus.links.zenoh.neighbours import PAUSE_TO_BEGIN, PAUSE_TO_LISTEN, PERIOD, Neighbours, open_router
 from tfbus.links.zenoh.sessions import (
+    CLOSING_TIME,
     Addresses,
     Keeper,
     Settings,
@@ -96,7 +97,8 @@ class ZenohRouter:
         try:
             return Neighbours(session)
         except zenoh.ZError as error:
-            close_session(session)
+            # zenoh may not end it, if a client asks for tokens at this moment.
+            begin_to_close(session).join(CLOSING_TIME)
             raise os_error(error, "the session of a router broke at once") from error
 
     def _keep(self) -> None:
