@@ -17,7 +17,7 @@ import pytest
 from beside import Ask, Table, Turn, edges, last_of, take_turns, timed, tree_of
 from cases import BASE, MANY, PERIOD, START, Case
 
-from tfbus import SECOND, PointCloud, Transform, TransformStamped, do_transform
+from tfbus import SECOND, PointCloud, TransformStamped
 
 pytest_plugins = ["side_by_side"]
 
@@ -234,23 +234,6 @@ def test_deskew(table: Table, name: str, span: int, count: int) -> None:
     sides = timed(lambda: tree.deskew(cloud, frame, BASE)), timed(lambda: found.apply(points))
     ours, theirs = take_turns(*sides, rounds=FEW_ROUNDS)
     table.compare(f"deskew {count:,} points, {name}", ours, "numpy with known transforms", theirs, "<= 4", "ms")
-
-
-def test_one_transform_for_all_points(table: Table) -> None:
-    transform = Transform.from_axis_angle((1.0, 2.0, 3.0), 0.7, (1.0, 2.0, 3.0))
-    answer = TransformStamped(BASE, "f0", START, transform)
-    cloud = PointCloud("f0", START, scattered_points())
-    matrix = transform.matrix().astype(np.float32)
-    turn, translation = matrix[:3, :3], matrix[:3, 3]
-
-    def bare() -> Points:
-        return cloud.points @ turn.T + translation
-
-    moved = do_transform(cloud, answer).points
-    assert moved.dtype == np.float32
-    np.testing.assert_allclose(moved, bare(), rtol=0, atol=2e-5)
-    ours, theirs = take_turns(timed(lambda: do_transform(cloud, answer)), timed(bare))
-    table.compare("do_transform 100,000 points, float32", ours, "points @ R.T + t", theirs, "<= 1.5", "ms")
 
 
 @pytest.mark.parametrize("form", [list, np.array])

@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
+import anyio
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,6 +18,7 @@ from tfbus import (
     Buffer,
     BufferStatistics,
     Bus,
+    BusClosedError,
     InvalidTransformError,
     SimulatedClock,
     TransformLookupError,
@@ -114,6 +116,109 @@ def test_a_late_buffer_with_prefill_answers_as_an_early_one(
     assert counted.offered == counted.inserted + counted.replaced + counted.expired
 
 
+# Buffers that share a tree
+
+
+@dataclass(frozen=True)
+class Join:
+    """A buffer joins: with the history of an earlier one, or with a new one."""
+
+    keep: int
+    prefill: int | None
+
+
+@dataclass(frozen=True)
+class Close:
+    buffer: int
+
+
+Step = Happening | Join | Close
+steps = st.lists(
+    st.one_of(
+        st.builds(Publish, st.lists(any_samples(FRAMES, 12), min_size=1, max_size=4).map(tuple)),
+        st.builds(Join, st.integers(2, 3), st.none() | st.integers(0, 7)),
+        st.builds(Join, st.just(3), st.none()),
+        st.builds(Close, st.integers(0, 7)),
+        st.builds(Remove, st.sampled_from(FRAMES)),
+        st.just(JumpBack()),
+    ),
+    max_size=24,
+)
+
+
+class Alone:
+    """A buffer that is the only one of its bus, on which everything happens as on another bus."""
+
+    def __init__(self, before: list[Happening], keep: int) -> None:
+        self.keep = keep
+        # What had happened when a buffer of the same history joined first.
+        self.before = before
+        self.clock = SimulatedClock(1_000)
+        self.bus = Bus(self.clock)
+        for happening in before:
+            happen(self.bus, self.clock, happening)
+        self.buffer = Buffer(self.bus, keep * NANO)
+
+    def catch_up(self, happenings: list[Happening]) -> None:
+        for happening in happenings[len(self.before) :]:
+            happen(self.bus, self.clock, happening)
+
+
+@given(steps)
+def test_buffers_that_share_a_tree_answer_as_each_would_alone(steps: list[Step]) -> None:
+    clock = SimulatedClock(1_000)
+    bus = Bus(clock)
+    happened: list[Happening] = []
+    joined: list[tuple[Buffer, Alone]] = []
+    open_ones: list[tuple[Buffer, Alone]] = []
+    for step in steps:
+        if isinstance(step, Join):
+            if step.prefill is None or not open_ones:
+                pair = Buffer(bus, step.keep * NANO), Alone(list(happened), step.keep)
+            else:
+                buffer, alone = open_ones[step.prefill % len(open_ones)]
+                pair = Buffer(bus, alone.keep * NANO, prefill=buffer), Alone(alone.before, alone.keep)
+                pair[1].catch_up(happened)
+            joined.append(pair)
+            open_ones.append(pair)
+        elif isinstance(step, Close):
+            if open_ones:
+                buffer, alone = open_ones.pop(step.buffer % len(open_ones))
+                buffer.close()
+                alone.buffer.close()
+        else:
+            happened.append(step)
+            happen(bus, clock, step)
+            for _, alone in joined:
+                happen(alone.bus, alone.clock, step)
+    for buffer, alone in joined:
+        assert list(everything(buffer.tree)) == list(everything(alone.buffer.tree))
+
+
+async def test_buffers_with_prefixes_share_their_samples_and_each_has_its_names_waits_and_end() -> None:
+    bus = Bus(SimulatedClock(1_000))
+    one, two = (Buffer(bus, prefix=f"r{number}/", shared={"map"}) for number in (1, 2))
+    async with anyio.create_task_group() as tasks:
+        found: dict[str, TransformStamped] = {}
+
+        async def ask(name: str, buffer: Buffer) -> None:
+            with suppress(BusClosedError):
+                found[name] = await buffer.lookup("map", "base", 5)
+
+        tasks.start_soon(ask, "one", one)
+        tasks.start_soon(ask, "two", two)
+        await anyio.wait_all_tasks_blocked()
+        assert [len(buffer.pending()) for buffer in (one, two)] == [1, 1]
+        assert [counted.waiting for counted in bus.statistics().buffers] == [1, 1]
+        two.close()
+        await anyio.wait_all_tasks_blocked()
+        assert [len(buffer.pending()) for buffer in (one, two)] == [1, 0]
+        bus.publish([moving("map", "r1/base", 5, 1.0), moving("map", "r2/base", 5, 2.0)])
+    assert {name: answer.child for name, answer in found.items()} == {"one": "base"}
+    assert one.lookup_nowait("map", "base").transform.translation == (1.0, 0.0, 0.0)
+    assert two.tree.frames() == [], "it was closed before"
+
+
 # The prefill and the samples of the bus
 
 
@@ -127,19 +232,21 @@ def test_latched_samples_of_the_bus_are_inserted_after_the_prefill() -> None:
     assert [x_of(late.tree, "base", frame, 15) for frame in ("laser", "imu", "arm")] == [5.0, 2.0, 6.0]
 
 
-def test_the_counters_of_a_prefilled_buffer_start_with_samples_of_the_bus() -> None:
-    bus = Bus(SimulatedClock())
+@pytest.mark.parametrize("keep", [10.0, 20.0])
+def test_the_counters_of_a_prefilled_buffer_start_with_samples_of_the_bus(bus: Bus, keep: float) -> None:
     first = Buffer(bus)
     bus.publish([*over("map", "a", range(10)), static("a", "laser")])
-    late = Buffer(bus, prefill=first)
-    assert bus.statistics().buffers[1] == BufferStatistics(offered=1, inserted=0, replaced=1, expired=0, waiting=0)
+    late = Buffer(bus, keep, prefill=first)
+    # A copy gets the latched samples once more.
+    latched = 0 if keep == first.tree.keep else 1
+    expected = BufferStatistics(offered=latched, inserted=0, replaced=latched, expired=0, waiting=0)
+    assert bus.statistics().buffers[1] == expected
     bus.publish(moving("map", "a", 10))
-    assert bus.statistics().buffers[1] == BufferStatistics(offered=2, inserted=1, replaced=1, expired=0, waiting=0)
+    assert bus.statistics().buffers[1] == replace(expected, offered=latched + 1, inserted=1)
     assert late.tree.edges() == first.tree.edges()
 
 
-def test_a_prefill_copies_bus_names_between_buffers_with_prefixes() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_prefill_copies_bus_names_between_buffers_with_prefixes(bus: Bus) -> None:
     first = Buffer(bus)
     bus.publish([moving("map", "robot1/base", 10, 3.0)])
     late = Buffer(bus, prefix="robot1/", shared={"map"}, prefill=first)
@@ -151,8 +258,7 @@ def test_a_prefill_copies_bus_names_between_buffers_with_prefixes() -> None:
 # Joining
 
 
-def test_a_buffer_prefilled_in_a_callback_has_the_current_batch_once() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_buffer_prefilled_in_a_callback_has_the_current_batch_once(bus: Bus) -> None:
     first = Buffer(bus)
     joined: list[Buffer] = []
     with bus.subscribe(lambda _: joined.append(Buffer(bus, prefill=first))):
@@ -163,8 +269,7 @@ def test_a_buffer_prefilled_in_a_callback_has_the_current_batch_once() -> None:
 
 
 @pytest.mark.parametrize("prefill", [5, "map", [moving("map", "a", 1)]])
-def test_a_prefill_that_is_no_buffer_or_tree_is_a_type_error(prefill: Any) -> None:
-    bus = Bus(SimulatedClock())
+def test_a_prefill_that_is_no_buffer_or_tree_is_a_type_error(bus: Bus, prefill: Any) -> None:
     with pytest.raises(TypeError, match="prefill"):
         Buffer(bus, prefill=prefill)
     assert bus.statistics().buffers == ()

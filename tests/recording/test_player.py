@@ -137,14 +137,6 @@ async def test_samples_are_published_as_they_were_recorded(tmp_path: Path) -> No
     assert (player.played, player.messages, player.passes, player.bad) == (4, 3, 1, {})
 
 
-async def test_a_simulated_clock_goes_from_message_to_message(tmp_path: Path) -> None:
-    times = (0.0, 0.1, 0.1, 0.25, 3_600.000_000_001, 3_600.5)
-    path, clock = write_recording(tmp_path / "run.mcap", *drive(times)), SimulatedClock()
-    _, heard = await played(path, clock)
-    assert heard.entries == drive(times)
-    assert clock.now() == START + 3_600 * SECOND + SECOND // 2
-
-
 async def test_a_task_that_a_message_wakes_sees_all_messages_of_that_log_time(tmp_path: Path) -> None:
     frames = ["base", *(f"f{number}" for number in range(9))]
     lines = [(received, "/tf", [moving("map", frame, received)]) for received in (5, 7) for frame in frames]
@@ -177,7 +169,7 @@ async def watch_positions(bus: Bus, buffer: Buffer, seen: list[float]) -> None:
         seen.append(found.transform.translation[0])
 
 
-@pytest.mark.parametrize("runs", [2, pytest.param(20, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("runs", [2, pytest.param(6, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 def test_timed_tasks_see_the_same_in_each_run(tmp_path: Path, backend: str, runs: int) -> None:
     # Several blocks, so that the reading thread is busy meanwhile.

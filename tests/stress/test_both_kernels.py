@@ -226,7 +226,7 @@ async def play(seed: int, steps: int, limits: float) -> None:
 
 
 @needs_both
-@pytest.mark.parametrize("seeds", [[0, 3025], pytest.param(range(1, 10), marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("seeds", [[3025], pytest.param(range(10), marks=pytest.mark.thorough)])
 def test_random_traffic_does_the_same_on_both_kernels(seeds: Iterable[int]) -> None:
     for seed in seeds:
         run(seed, 250)

@@ -41,8 +41,9 @@ enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quat
 static PyTypeObject *ColumnsType, *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
 static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType, *MethodType;
 static PyObject *empty_string, *raise_string, *drop_string, *at_string, *paths_string, *memory_string;
-static PyObject *source_at_string, *fixed_string, *max_age_string, *not_before_string, *not_after_string;
-static PyObject *tolerance_string, *max_gap_string, *extrapolate_string, *nanoseconds_string, *policy_use_string, *error_string;
+static PyObject *child_string, *source_at_string, *fixed_string, *max_age_string, *not_before_string;
+static PyObject *not_after_string, *tolerance_string, *max_gap_string, *extrapolate_string, *nanoseconds_string;
+static PyObject *policy_use_string, *error_string, *passed_string;
 static PyObject *bound_method; /* types.MethodType */
 static PyObject *array_type;   /* numpy.ndarray; NULL until somebody asks with an array */
 

@@ -4,8 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Any, SupportsIndex, TypeVar
 
-import anyio.lowlevel
-
+from tfbus._aio.loops import checkpoint, on_asyncio
 from tfbus.buffer.lookups import LocalNames, Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
@@ -14,7 +13,7 @@ from tfbus.errors import ExtrapolationError, TransformLookupError
 from tfbus.frames import as_prefix, is_frame
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.registration import Registration
-from tfbus.stamps import LATEST, AtLike, as_at
+from tfbus.stamps import LATEST, AtLike, as_at, as_duration
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
@@ -67,6 +66,10 @@ class Buffer:
 
     Notes
     -----
+    Buffers of one bus with the same `keep` share their samples, in memory and at work, if they would hold the same: if
+    no sample came between their beginnings, or the later one was prefilled from the earlier one. When one of them is
+    closed and still used, the next sample costs one copy of all.
+
     Any thread may use the methods that only read. `lookup`, `transform`, `watch` and `close` belong to the event loop
     of the bus.
 
@@ -97,20 +100,31 @@ class Buffer:
         named = as_prefix(prefix, shared)
         self._local_names = None if named is None else LocalNames(named)
         window = window_of(keep)
+        self._share = bus._attach(window, self._prefilled(prefill, window))
+        self._tree = tree_of(self._share.live.forest, keep, bus.max_translation)
+        self._lookups = Lookups(self._share, bus, self._local_names)
+        self._stand_on(self._share.live.forest)
+
+    def _prefilled(self, prefill: "Buffer | TransformTree | None", window: int | None) -> Forest | LiveTree | None:
+        """What the buffer begins with: nothing, the live tree of a buffer that has all it would have, or a copy."""
         if prefill is None:
-            self._forest = Forest(window)
-        else:
-            tree = prefill.tree if isinstance(prefill, Buffer) else prefill
-            if not isinstance(tree, TransformTree):
-                raise TypeError(f"prefill must be a Buffer or a TransformTree, not {prefill!r}")
-            bus._check_thread()
-            self._forest = forest_of(tree).copy_within(window)
-        self._paths = self._forest.paths if named is None else self._forest.local_paths
-        self._paths.now = bus.clock.now
-        self._tree = tree_of(self._forest, keep, bus.max_translation)
-        self._live = LiveTree(self._forest, bus._announce_past_loop)
-        self._lookups = Lookups(self._live, bus, self._local_names)
-        bus._attach(self._live)
+            return None
+        tree = prefill
+        if isinstance(prefill, Buffer):
+            share, tree = prefill._share, prefill.tree
+            if prefill.bus is self.bus and share.end_reason is None and share.live.forest.window == window:
+                return share.live
+        if not isinstance(tree, TransformTree):
+            raise TypeError(f"prefill must be a Buffer or a TransformTree, not {prefill!r}")
+        self.bus._check_thread()
+        return forest_of(tree).copy_within(window)
+
+    def _stand_on(self, forest: Forest) -> None:
+        self._forest = self._lookups.forest = forest
+        self._paths = forest.paths if self._local_names is None else forest.local_paths()
+        self._paths.now = self.bus.clock.now
+        plain = self._local_names is None and self._lookups.has_alarms and forest is self._share.live.forest
+        self._feed = self._lookups.feed if plain else None
 
     @property
     def tree(self) -> TransformTree:
@@ -168,7 +182,7 @@ class Buffer:
             above, below = names.on_bus(target), names.on_bus(source)
             found = answer(self._forest, above, below, at, source_at, via, bounds, policy)
             # The next such lookup is as plain as one without a prefix.
-            self._forest.keep_locally((target, source), above, below)
+            self._forest.keep_locally(self._paths, (target, source), above, below)
         except ExtrapolationError as error:
             self._lookups.note_ahead(error)
             raise
@@ -236,9 +250,29 @@ class Buffer:
         TypeError
             If a stamp is a float, or `max_age` comes without a `LATEST`.
         """
-        policy = policy_of(tolerance, max_gap, extrapolate)
-        question = Question(target, source, as_at(at), as_at(source_at), fixed, max_age, policy)
-        return await self._lookups.lookup(self._on_bus(question), timeout)
+        waits_plainly = max_age is None and source_at is None and fixed is None and not tolerance
+        if self._feed is None or not waits_plainly or max_gap is not None or extrapolate is not None:
+            policy = policy_of(tolerance, max_gap, extrapolate)
+            question = Question(target, source, as_at(at), as_at(source_at), fixed, max_age, policy)
+            return await self._lookups.lookup(self._on_bus(question), timeout)
+        last_reset = self._share.live.last_reset
+        turn = on_asyncio()
+        wait = self._feed.ask(target, source, at, turn)
+        if timeout is not None:
+            wait.patience = as_duration(timeout, "timeout")
+        try:
+            if not turn:
+                await checkpoint()
+            found: TransformStamped | None = await wait
+            if found is None or self._share.live.last_reset is not last_reset:
+                wait.asked = Question(target, source, as_at(at))
+                return await self._lookups.go_on(wait, last_reset)
+        except BaseException:
+            self._lookups.end(wait)
+            raise
+        if wait.cancel_end is not None:
+            wait.cancel_end()
+        return found
 
     async def _lookup_among(self, questions: Sequence[Question]) -> None:
         """Wait until each question has had an answer; if waiting cannot help one of them, raise its error at once.
@@ -295,7 +329,7 @@ class Buffer:
         """
         question = question_of(data, target, as_at(at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
         if self._is_in_place(question):
-            await anyio.lowlevel.checkpoint()
+            await checkpoint()
             return data
         return do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
 
@@ -466,31 +500,32 @@ class Buffer:
 
     def pending(self) -> tuple[PendingLookup, ...]:
         """The lookups that wait now, and the watches without an answer, each with the error that blocks it."""
-        pending = self._live.waiting.pending()
-        return pending if self._local_names is None else tuple(map(self._local_names.pending, pending))
+        return tuple(self._pending(None))
 
     def describe(self) -> str:
         """The tree as text, with each edge's rate, age, span and authority, and some of the lookups that wait."""
         lines = [describe(self._edges(), self._clock.now())]
-        pending = self.pending()
-        lines += [f"waiting: {lookup}" for lookup in pending[:_DESCRIBED]]
-        if len(pending) > _DESCRIBED:
-            lines.append(f"waiting: {len(pending) - _DESCRIBED} more lookups, see pending()")
+        lines += [f"waiting: {lookup}" for lookup in self._pending(_DESCRIBED)]
+        more = len(self._share.waiters) - _DESCRIBED
+        if more > 0:
+            lines.append(f"waiting: {more} more lookups, see pending()")
         return "\n".join(lines)
 
     def on_close(self, callback: Callable[[], object]) -> Registration:
         """Call `callback` once, on the event loop: when this buffer or its bus is closed, or now if one is."""
-        return self._live.on_end(callback)
+        return self._share.on_end(callback)
 
     def close(self) -> None:
         """Leave the bus; waiting lookups end with `BusClosedError`. Buffered transforms can still be looked up."""
-        self.bus._detach(self._live)
-        self._live.end("the buffer is closed")
-        self._live.call_end_callbacks()
+        if self.bus._detach(self._share):
+            self._share.live.keep_for(self, self._tree)
+        self._share.end("the buffer is closed")
+        self._share.call_end_callbacks()
 
     def __repr__(self) -> str:
         keep = "everything" if self.tree.keep is None else f"{self.tree.keep:g} s"
-        state = "closed" if self._live.end_reason is not None else f"{counted(len(self.pending()), 'lookup')} waiting"
+        waiting = counted(len(self._share.waiters), "lookup")
+        state = "closed" if self._share.end_reason is not None else f"{waiting} waiting"
         return f"<Buffer of {counted(len(self.tree.frames()), 'frame')}, keeps {keep}, {state}>"
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[Any, ...]:
@@ -499,6 +534,10 @@ class Buffer:
     def _repr_html_(self) -> str:
         """The tree as notebooks show it, with ages counted from the clock's now."""
         return to_html(self._edges(), self._clock.now()) + legend()
+
+    def _pending(self, most: int | None) -> Iterable[PendingLookup]:
+        pending = self._lookups.pending(most)
+        return pending if self._local_names is None else map(self._local_names.pending, pending)
 
     def _edges(self) -> list[Edge]:
         """The newest edges, with the names of this buffer."""

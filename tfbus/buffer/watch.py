@@ -39,10 +39,11 @@ class Watch:
         max_rate: float | None,
         lookups: Lookups,
     ) -> None:
-        live = lookups.live
+        share = lookups.share
+        live = share.live
         for name in (question.target, question.source):
             if not is_frame(name):
-                raise UnknownFrameError(frame=name, known=live.forest.some_frames())
+                raise UnknownFrameError(frame=name, known=lookups.forest.some_frames())
         if question.max_age is not None:
             lookups.bounds(question.max_age, question.at, question.source_at)
         self.skipped = 0
@@ -50,7 +51,7 @@ class Watch:
         self._min_translation = _threshold(min_translation, "min_translation", "m", math.inf)
         self._min_rotation = _threshold(min_rotation, "min_rotation", "rad", math.pi)
         self._period = _period(max_rate)
-        self._live = live
+        self._watching = live.watching
         self._lookups = lookups
         self._clock = lookups.bus.clock
         self._check_thread = lookups.bus._check_thread
@@ -58,10 +59,10 @@ class Watch:
         self._last: TransformStamped | None = None
         self._last_given_at: int | None = None
         self._state = WatchState(question.target, question.source, self._reader.wake)
-        if live.end_reason is not None:
+        if share.end_reason is not None:
             self._state.ended = True
             return
-        live.watching.add(self._state)
+        share.watch(self._state)
         try:
             self._update()
         except _NO_ANSWER:
@@ -73,7 +74,7 @@ class Watch:
         """End the iteration; a second call does nothing."""
         if self._state.waiting:
             self._check_thread()
-        self._live.watching.remove(self._state)
+        self._watching.remove(self._state)
         self._state.ended = True
         self._reader.wake()
 
@@ -132,9 +133,9 @@ class Watch:
         try:
             answer = self._lookups.lookup_nowait(self._question)
         except _NO_ANSWER:
-            self._live.watching.set_no_answer(state)
+            self._watching.set_no_answer(state)
             raise
-        self._live.watching.set_answer(state, self._live.forest, answer.stamp)
+        self._watching.set_answer(state, self._lookups.forest, answer.stamp)
         state.outdated = False
         return answer
 
@@ -171,13 +172,13 @@ class Watch:
     async def _park(self, blocker: TransformLookupError, since: int) -> None:
         """Wait for a sample that may have removed the cause of `blocker`."""
         waiter = Waiter(self._question, since, self._reader.wake)
-        self._live.park(waiter, blocker)
+        self._lookups.share.park(waiter, blocker)
         try:
             pause = REPORT_AFTER - to_seconds(self._clock.now() - since)
             while pause <= 0.0 or not await self._wait(pause):
-                pause = self._lookups.report(self._question, since, blocker)
+                pause = self._lookups.report()
         finally:
-            self._live.waiting.remove(waiter)
+            self._lookups.share.live.waiting.remove(waiter)
 
     async def _wait(self, seconds: float = math.inf) -> bool:
         """Wait until the watch is woken, at most for some time; return whether it was woken."""

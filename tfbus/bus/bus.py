@@ -34,8 +34,8 @@ from tfbus.geometry.stamped import MAX_TRANSLATION, Batch, TransformStamped, as_
 from tfbus.registration import Registration
 from tfbus.stamps import StampLike, StampsLike, format_stamp
 from tfbus.statistics import BusStatistics
-from tfbus.tree.forest import LoopingSample
-from tfbus.waiting.live_tree import LiveTree
+from tfbus.tree.forest import Forest, LoopingSample
+from tfbus.waiting.live_tree import Counters, LiveTree, Share
 from tfbus.which_kernel import Intake
 
 
@@ -70,12 +70,16 @@ class OwnerThread:
         self.entered: WeakSet[object] = WeakSet()
         _OWNERS.add(self)
 
+    def is_here(self) -> bool:
+        """Whether this thread owns the bus, and has run an event loop with it."""
+        return get_ident() == self.thread and self._on_a_loop
+
     def check(self) -> None:
         """Raise `RuntimeError` unless this thread owns the bus, or runs an event loop and may take it over."""
-        thread = get_ident()
-        if thread == self.thread and self._on_a_loop:
+        if self.is_here():
             return
         self.check_process()
+        thread = get_ident()
         on_a_loop = _runs_a_loop()
         if thread != self.thread:
             if self._on_a_loop or not on_a_loop:
@@ -202,7 +206,9 @@ class Bus:
             as_max_frames(max_frames),
         )
         self._subscribers = Subscribers(self._log, self._announcer)
-        self._buffers: dict[LiveTree, int] = {}
+        # The shares of all buffers; and their trees, each with the moment at which another buffer would have the same.
+        self._buffers: dict[Share, None] = {}
+        self._trees: dict[LiveTree, tuple[int, int] | None] = {}
         self._late: dict[LiveTree, LateBuffer] = {}
         self._streams: list[Stream] = []
         self._threads: list[ThreadPublisher] = []
@@ -210,11 +216,15 @@ class Bus:
         self._intake: Any = None
         self._take: Callable[[object, object], bool | None] = _take_nothing
         if Intake is not None:
-            listeners = self._subscribers.callbacks, self._streams, self._events, self._late
-            self._intake = Intake(self._topology.judge, TransformStamped, listeners)
+            listeners = self._subscribers.callbacks, self._streams, self._events
+            busy = self._subscribers.calling, self._late
+            self._intake = Intake(self._topology.judge, TransformStamped, self._tell, listeners, busy)
             self._take = self._intake.take
         self._owner = OwnerThread(self._intake)
+        # Whether this thread owns the bus, and has run an event loop with it. Called by buffers.
+        self._is_here = self._owner.is_here
         self._resets = 0
+        self._removals = 0
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
         self._relay: object = None
         # Links, recorders and the like; a child made by `fork` has them no more.
@@ -268,7 +278,7 @@ class Bus:
             If this is not the bus's thread, or this process was forked and has the bus without its links; if
             subscribers that publish have queued more than 1,000 batches.
         """
-        # The usual case: samples only continue known edges, and nobody but the buffers gets them.
+        # The usual case: samples only continue known edges.
         taken = self._take(samples, invalid)
         if taken:
             return
@@ -284,21 +294,13 @@ class Bus:
             batch = as_batch(samples)
         else:
             batch = self._well_typed(samples)
-        callbacks = self._subscribers.callbacks
-        if callbacks:
-            self._subscribers.check_backlog()
+        self._subscribers.check_backlog()
         batch = self._topology.accept(batch, invalid, judged=taken is None)
         if not batch:
             return
         self._published += len(batch)
         error = self._insert(batch)
-        for stream in self._streams:
-            stream.put(batch)
-        if self._events:
-            for events in self._events:
-                events.arrived(batch)
-        if callbacks:
-            self._subscribers.deliver(batch)
+        self._tell(batch)
         if error is not None:
             raise error
 
@@ -482,26 +484,60 @@ class Bus:
         self._check_usable()
         return ThreadPublisher(self, capacity)
 
-    def _attach(self, buffer: LiveTree) -> None:
-        """Give a buffer the latched samples, and from now on all that are published. Called by `Buffer`."""
+    def _attach(self, window: int | None, prefill: Forest | LiveTree | None) -> Share:
+        """A share of a live tree, which gets the latched samples, and from now on all that are published.
+
+        Called by `Buffer`.
+
+        Parameters
+        ----------
+        window : int or None
+            ns.
+        prefill : Forest or LiveTree or None
+            A forest with some history; or the tree of another buffer of this bus, to be shared. Without either, the
+            tree is shared with buffers that have joined since the last sample or removal.
+        """
         self._check_usable()
-        latched = tuple(self._topology.latched.values())
-        late = LateBuffer(buffer, self._topology)
-        buffer.tell_expired = self._topology.expired
-        self._buffers[buffer] = self._samples() - len(latched)
+        samples = self._samples()
+        if isinstance(prefill, LiveTree):
+            live, before = prefill, prefill.counters(samples)
+        else:
+            moment = samples, self._removals + self._resets
+            latched = tuple(self._topology.latched.values())
+            before = Counters(samples - len(latched))
+            trees = self._trees.items() if prefill is None else ()
+            known = next((live for live, since in trees if since == moment and live.forest.window == window), None)
+            live = known or LiveTree(prefill or Forest(window), self._announce_past_loop)
+            if known is None:
+                self._fill(live, latched)
+                self._trees[live] = moment if prefill is None else None
+                self._connect_feeds()
+        share = Share(live, before)
+        self._buffers[share] = None
+        return share
+
+    def _fill(self, live: LiveTree, latched: Batch) -> None:
+        """Give a new tree the latched samples."""
+        late = LateBuffer(live, self._topology)
+        live.tell_expired = self._topology.expired
         if latched:
             late.insert(latched)
         if not late.has_caught_up:
-            self._late[buffer] = late
-        self._connect_feeds()
+            self._late[live] = late
 
-    def _detach(self, buffer: LiveTree) -> None:
-        """Take a buffer off the bus, if it is on it. Called by `Buffer`."""
-        if buffer.has_waiters:
+    def _detach(self, share: Share) -> bool:
+        """Take a buffer off the bus, if it is on it; whether other buffers share its tree. Called by `Buffer`."""
+        if share.has_waiters:
             self._check_thread()
-        self._buffers.pop(buffer, None)
-        self._late.pop(buffer, None)
+        if share not in self._buffers:
+            return False
+        del self._buffers[share]
+        if any(other.live is share.live for other in self._buffers):
+            return True
+        del self._trees[share.live]
+        self._late.pop(share.live, None)
         self._connect_feeds()
+        return False
 
     def remove_frame(self, frame: str) -> None:
         """Remove a frame from every buffer and from pending batches, and do not give it to later subscribers.
@@ -515,16 +551,17 @@ class Bus:
         """
         self._check_usable()
         on_bus = frame in self._topology or frame in self._topology.names
-        if not on_bus and not any(frame in buffer.forest.names for buffer in self._buffers):
+        if not on_bus and not any(frame in live.forest.names for live in self._trees):
             raise UnknownFrameError(frame=frame, known=self._topology.names.some())
+        self._removals += 1
         self._topology.remove(frame)
         self._subscribers.forget(frame)
         for publisher in self._threads:
             publisher.forget(frame)
         for stream in self._streams:
             stream.queue.forget(frame)
-        for buffer in self._buffers:
-            buffer.remove_frame(frame)
+        for live in self._trees:
+            live.remove_frame(frame)
         for late in self._late.values():
             late.forget(frame)
         self._subscribers.notify_removed(frame)
@@ -541,7 +578,7 @@ class Bus:
             clock_resets=self._resets,
             callbacks_failed=self._subscribers.failures,
             frames=len(self._topology),
-            buffers=tuple(buffer.statistics(samples - before) for buffer, before in self._buffers.items()),
+            buffers=tuple(share.statistics(samples) for share in self._buffers),
             queues=(
                 *(stream.queue.statistics("stream") for stream in self._streams),
                 *(publisher.queue.statistics("threadsafe") for publisher in self._threads),
@@ -564,7 +601,7 @@ class Bus:
         if self._closed:
             return
         readers: list[Stream | EventStream] = [*self._streams, *self._events]
-        if any(reader.waiting for reader in readers) or any(buffer.has_waiters for buffer in self._buffers):
+        if any(reader.waiting for reader in readers) or any(share.has_waiters for share in self._buffers):
             self._check_thread()
         self._closed = True
         if self._intake is not None:
@@ -577,12 +614,12 @@ class Bus:
             publisher.discard()
         for reader in readers:
             reader.end()
-        buffers = tuple(self._buffers)
-        for buffer in buffers:
-            buffer.end("the bus is closed")
+        shares = tuple(self._buffers)
+        for share in shares:
+            share.end("the bus is closed")
         # These run foreign code, so only after every waiter has been woken.
-        for buffer in buffers:
-            buffer.call_end_callbacks()
+        for share in shares:
+            share.call_end_callbacks()
 
     def __enter__(self) -> "Bus":
         return self
@@ -594,7 +631,7 @@ class Bus:
 
     def _connect_feeds(self) -> None:
         if self._intake is not None:
-            self._intake.feeds = tuple((buffer.feed, buffer.insert_closely) for buffer in self._buffers)
+            self._intake.feeds = tuple((live.feed, live.insert_closely) for live in self._trees)
 
     def _samples(self) -> int:
         """Number of samples that were published."""
@@ -614,21 +651,30 @@ class Bus:
             self._events.remove(events)
 
     def _insert(self, batch: Batch) -> BaseException | None:
-        """Insert a batch into all buffers, even if one of them raises; return the first error, or None."""
+        """Insert a batch into all trees, even if one of them raises; return the first error, or None."""
         first = None
-        for buffer in self._buffers:
-            late = self._late.get(buffer) if self._late else None
+        for live in self._trees:
+            late = self._late.get(live) if self._late else None
             try:
                 if late is None:
-                    buffer.insert(batch)
+                    live.insert(batch)
                     continue
                 late.insert(batch)
                 if late.has_caught_up:
                     # A wake-up that publishes may have removed it already.
-                    self._late.pop(buffer, None)
+                    self._late.pop(live, None)
             except BaseException as error:  # noqa: BLE001 - it is raised after all have the batch
                 first = first or error
         return first
+
+    def _tell(self, batch: Batch) -> None:
+        """Give an accepted batch to everybody but the buffers."""
+        for stream in self._streams:
+            stream.put(batch)
+        for events in self._events:
+            events.arrived(batch)
+        if self._subscribers.callbacks:
+            self._subscribers.deliver(batch)
 
     def _remove_if_known(self, frame: str) -> None:
         with suppress(UnknownFrameError):
@@ -672,8 +718,8 @@ class Bus:
             publisher.discard()
         for stream in self._streams:
             stream.queue.discard_moving()
-        for buffer in self._buffers:
-            buffer.reset(before, after)
+        for live in self._trees:
+            live.reset(before, after)
         for late in self._late.values():
             late.clear_moving()
 

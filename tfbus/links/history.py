@@ -68,7 +68,7 @@ def chunk_of_past(
 
 def _recent(bus: Bus, frame: str, seconds: float) -> list[TransformStamped]:
     """The newest samples of a frame, of the buffer that holds the longest history of it."""
-    held = (live.forest.frames.get(frame) for live in bus._buffers)
+    held = (live.forest.frames.get(frame) for live in bus._trees)
     histories = [history for history in held if history is not None and history.oldest is not None]
     if not histories:
         return []

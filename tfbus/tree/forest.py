@@ -17,6 +17,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager
 from itertools import chain, islice
 from typing import Any, NamedTuple, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
@@ -413,7 +414,7 @@ class PathCache(Paths):
         The lock of the forest.
     """
 
-    __slots__ = ("_count", "_older")
+    __slots__ = ("__weakref__", "_count", "_older")
 
     def __init__(self, lock: AbstractContextManager[Any]) -> None:
         super().__init__(lock, LATEST, TransformStamped)
@@ -475,8 +476,8 @@ class LoopingSample(NamedTuple):
 class Forest:
     """The histories of all frames that have a parent.
 
-    `insert`, `commit`, `remove`, `clear`, `search`, `keep_locally`, `known_frames`, `some_frames`, `read_all`, `copy`
-    and `copy_within` take the lock themselves. The caller of every other method holds it.
+    `insert`, `commit`, `remove`, `clear`, `search`, `local_paths`, `keep_locally`, `known_frames`, `some_frames`,
+    `read_all`, `copy` and `copy_within` take the lock themselves. The caller of every other method holds it.
 
     Parameters
     ----------
@@ -493,8 +494,6 @@ class Forest:
     names : KnownFrames
     paths : PathCache
         The newest paths that have been found and are permanent. A change that could make one wrong empties it.
-    local_paths : PathCache
-        Some of the `paths` under other names, which `keep_locally` has given them; it is emptied with them.
     changing_paths : dict of (target, source) to Path
         The newest paths that have been found and are not permanent.
     changed : set of str
@@ -522,7 +521,7 @@ class Forest:
         self.frames: dict[str, FrameHistory] = {}
         self.names = KnownFrames()
         self.paths = PathCache(self.lock)
-        self.local_paths = PathCache(self.lock)
+        self._local_paths: WeakSet[PathCache] = WeakSet()
         self.changing_paths: dict[tuple[str, str], Path] = {}
         self.changed: set[str] = set()
         self.new_parents: set[str] = set()
@@ -704,10 +703,11 @@ class Forest:
         self.expired_samples.clear()
 
     def forget_paths(self) -> None:
-        """Empty `paths`, `local_paths` and `changing_paths`."""
+        """Empty `paths`, the caches of `local_paths` and `changing_paths`."""
         self.structure += 1
         self.paths.clear()
-        self.local_paths.clear()
+        for local in self._local_paths:
+            local.clear()
         self.changing_paths.clear()
 
     # Questions
@@ -777,14 +777,21 @@ class Forest:
                 self.changing_paths.clear()
             self.changing_paths[target, source] = path
 
-    def keep_locally(self, local: tuple[str, str], target: str, source: str) -> None:
-        """Keep a path that was found under local names of its two ends as well. Takes the lock."""
-        if self.local_paths.holds(*local):
+    def local_paths(self) -> PathCache:
+        """A new cache for `keep_locally`; it is emptied with `paths`."""
+        local = PathCache(self.lock)
+        with self.lock:
+            self._local_paths.add(local)
+        return local
+
+    def keep_locally(self, paths: PathCache, local: tuple[str, str], target: str, source: str) -> None:
+        """Keep a path that was found in a cache of `local_paths`, under local names of its ends. Takes the lock."""
+        if paths.holds(*local):
             return
         with self.lock:
             path = self.paths.find(target, source)
             if path is not None:
-                self.local_paths.keep(*local, path)
+                paths.keep(*local, path)
 
     def known_frames(self) -> tuple[str, ...]:
         """Every frame that a sample names, sorted. Takes the lock."""

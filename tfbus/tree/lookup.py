@@ -106,8 +106,7 @@ def _nanoseconds(seconds: float, name: str) -> int:
     return STAMP_MAX if duration == math.inf else from_seconds(duration)
 
 
-@dataclass(frozen=True, slots=True)
-class Question:
+class Question(NamedTuple):
     """The arguments of a lookup: stamps in ns, `max_age` in s."""
 
     target: str

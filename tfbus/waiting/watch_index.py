@@ -36,9 +36,23 @@ class WatchState:
         The frames under which the index keeps this watch.
     path : Path or None
         The path of the answer, if it is a permanent one.
+    share : object
+        The buffer of the watch, as the one who adds it names it.
     """
 
-    __slots__ = ("ended", "frames", "outdated", "path", "reset", "source", "target", "updates", "waiting", "wake")
+    __slots__ = (
+        "ended",
+        "frames",
+        "outdated",
+        "path",
+        "reset",
+        "share",
+        "source",
+        "target",
+        "updates",
+        "waiting",
+        "wake",
+    )
 
     def __init__(self, target: str, source: str, wake: Callable[[], object]) -> None:
         self.target = target
@@ -51,10 +65,11 @@ class WatchState:
         self.waiting = False
         self.frames: frozenset[str] = frozenset()
         self.path: Path | None = None
+        self.share: object = None
 
 
 class WatchIndex:
-    """The open watches of one buffer.
+    """The open watches of all buffers that share a tree.
 
     Attributes
     ----------
@@ -69,10 +84,9 @@ class WatchIndex:
     def __len__(self) -> int:
         return len(self._open)
 
-    @property
-    def has_waiters(self) -> bool:
-        """Whether a task waits for one of the watches."""
-        return any(state.waiting for state in self._open)
+    def has_waiters(self, share: object) -> bool:
+        """Whether a task waits for one of the watches of a buffer."""
+        return any(state.waiting for state in self._open if state.share is share)
 
     def add(self, state: WatchState) -> None:
         """Add a watch without an answer; only resets and the end concern it."""
@@ -147,9 +161,9 @@ class WatchIndex:
             self.set_no_answer(state)
         return list(self._open)
 
-    def end(self) -> list[WatchState]:
-        """Remove all watches for good; return all, to be woken."""
-        ended = list(self._open)
+    def end(self, share: object) -> list[WatchState]:
+        """Remove all watches of a buffer for good; return them, to be woken."""
+        ended = [state for state in self._open if state.share is share]
         for state in ended:
             state.ended = True
             self.remove(state)
