@@ -522,21 +522,23 @@ decoded_sample(PyTypeObject *kind, PyObject *names, PyObject *tag, int64_t stamp
 /* The plain samples of a message body from an offset on, at most `count`, as a list: little endian, with names that were
  * decoded before. A single tag is that of all. */
 static PyObject *
-decoded_samples(const char *body, int64_t size, int64_t *at, Py_ssize_t count, PyObject *tags, PyObject *names,
+decoded_samples(const char *body, int64_t size, int64_t *place, Py_ssize_t count, PyObject *tags, PyObject *names,
                 PyTypeObject *kind)
 {
+    int64_t at = *place;
+    const Py_ssize_t last_tag = PyTuple_Size(tags) - 1;
     PyObject *samples = PyList_New(0);
     for (Py_ssize_t i = 0; samples != NULL && i < count; i++) {
         int32_t seconds;
         uint32_t nanoseconds, length;
         double row[WIDTH];
-        if (*at < 0 || *at > size - 12) {
+        if (at < 0 || at > size - 12) {
             break;
         }
-        memcpy(&seconds, body + *at, 4);
-        memcpy(&nanoseconds, body + *at + 4, 4);
-        memcpy(&length, body + *at + 8, 4);
-        const int64_t middle = (*at + 12 + length + 3) & -4;
+        memcpy(&seconds, body + at, 4);
+        memcpy(&nanoseconds, body + at + 4, 4);
+        memcpy(&length, body + at + 8, 4);
+        const int64_t middle = (at + 12 + length + 3) & -4;
         if (middle > size - 4) {
             break;
         }
@@ -552,10 +554,10 @@ decoded_samples(const char *body, int64_t size, int64_t *at, Py_ssize_t count, P
             || nanoseconds >= 1000000000) {
             break;
         }
-        PyObject *piece = PyBytes_FromStringAndSize(body + *at + 8, (Py_ssize_t)(end - *at - 8));
+        PyObject *piece = PyBytes_FromStringAndSize(body + at + 8, (Py_ssize_t)(end - at - 8));
         PyObject *known = piece == NULL ? NULL : PyDict_GetItemWithError(names, piece);
         Py_XDECREF(piece);
-        PyObject *tag = PyTuple_GetItem(tags, PyTuple_Size(tags) == 1 ? 0 : i);
+        PyObject *tag = PyTuple_GetItem(tags, i < last_tag ? i : last_tag);
         PyObject *sample = known == NULL ? NULL
                                          : decoded_sample(kind, known, tag, (int64_t)seconds * 1000000000 + nanoseconds,
                                                           body + end);
@@ -567,8 +569,9 @@ decoded_samples(const char *body, int64_t size, int64_t *at, Py_ssize_t count, P
             break;
         }
         Py_DECREF(sample);
-        *at = end + (int64_t)ROW_SIZE;
+        at = end + (int64_t)ROW_SIZE;
     }
+    *place = at;
     return samples;
 }
 

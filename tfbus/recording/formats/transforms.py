@@ -47,6 +47,8 @@ FOXGLOVE_TYPES: Final = frozenset(
 COMPRESSED: Final = b"\x28\xb5\x2f\xfd"
 """The first bytes of Zstandard data (RFC 8878, section 3.1.1); a message in CDR begins with a zero."""
 
+_MAX_SHAPES: Final = 2_048
+_MAX_SHAPE: Final = 256
 _NUMBERS: Final = struct.Struct("<7d")
 _HEADER: Final = b"\x00\x01\x00\x00"
 
@@ -288,6 +290,8 @@ class ChannelDecoder:
     authorities : tuple of (str, int)
         The authorities of successive transforms of a message, each with their number; a single one stands for all
         transforms.
+    parse : callable
+        Gives the transforms of a message with their bytes: see `parser_of`.
     decode_plain : callable or None
         Gives the samples of a message that `decode` would give without an error, as a tuple, or None: see
         `tfbus.tf_message.plain_decoder`. None where no message is plain.
@@ -304,7 +308,8 @@ class ChannelDecoder:
         self.decode_plain: Callable[[bytes], tuple[TransformStamped, ...] | None] | None = None
         if self._is_cdr and not prefix and len(self.authorities) == 1:
             self.decode_plain = plain_decoder((self.authorities[0][0], static), MAX_MESSAGE)
-        self._parse = parser_of(channel)
+        self.parse = parser_of(channel)
+        self._single: set[bytes] = set()
         self._names: dict[tuple[str, str], tuple[str, str]] = {}
 
     def decode(self, payload: bytes) -> Decoded[TransformStamped]:
@@ -316,13 +321,27 @@ class ChannelDecoder:
         """
         payload = bounded(payload)
         if not self._is_cdr:
-            payload = write_cdr(self._parse(payload))
+            payload = write_cdr(self.parse(payload))
         order: Literal["little", "big"] = "little" if payload[1:2] == b"\1" else "big"
         count = int.from_bytes(payload[4:8], order)
         decoded = decode(payload, self._tags(count), bare_names=True)
         if self.prefix:
             decoded.samples[:] = map(self._prefixed, decoded.samples)
         return decoded
+
+    def count(self, payload: bytes) -> int:
+        """The number of transforms in a message; raises `MalformedMessageError` as `parse`."""
+        # Messages with one transform of the same frames differ in the stamp and the numbers only.
+        shape = payload[:8] + payload[16:-56]
+        if shape in self._single:
+            return 1
+        count = len(self.parse(payload))
+        # Behind the numbers there may be padding, which is not part of the shape.
+        if count == 1 and self._is_cdr and len(payload) % 8 == 4 and len(shape) <= _MAX_SHAPE:
+            if len(self._single) >= _MAX_SHAPES:
+                self._single.clear()
+            self._single.add(shape)
+        return count
 
     def authority_of(self, place: int, count: int) -> str:
         """The authority of a transform of a message with `count` transforms; empty if their number does not fit."""
