@@ -32,6 +32,7 @@ from hypothesis import HealthCheck, configuration, is_hypothesis_test, settings
 from support.extras import absent_extra
 
 import tfbus
+from tfbus import Buffer, Bus, SimulatedClock
 
 T = TypeVar("T")
 Backend = tuple[str, dict[str, Any]]
@@ -235,3 +236,20 @@ def run(anyio_backend: Backend) -> Callable[[Callable[[], Awaitable[T]]], T]:
         return anyio.run(function, backend=name, backend_options=options)
 
     return run_on_backend
+
+
+@pytest.fixture
+def clock() -> SimulatedClock:
+    return SimulatedClock()
+
+
+@pytest.fixture
+def bus(clock: SimulatedClock) -> Iterator[Bus]:
+    with Bus(clock) as bus:
+        yield bus
+
+
+@pytest.fixture
+def buffer(bus: Bus) -> Iterator[Buffer]:
+    with Buffer(bus) as buffer:
+        yield buffer

@@ -50,8 +50,7 @@ async def test_simulated_time_stays_at_the_last_stamp_and_sleeps_go_on() -> None
     TransformStamped("map", "base", clock.now(), Transform())
 
 
-async def test_tasks_that_have_just_been_started_fall_asleep_before_time_moves() -> None:
-    clock = SimulatedClock()
+async def test_tasks_that_have_just_been_started_fall_asleep_before_time_moves(clock: SimulatedClock) -> None:
     async with anyio.create_task_group() as tasks:
         asked = [Asked(tasks, partial(clock.sleep_until, k * SECOND)) for k in range(1, 4)]
         await clock.advance(3.0)
@@ -121,8 +120,7 @@ def test_any_tasks_that_only_sleep_run_in_the_order_of_an_obvious_model(run: Run
     assert run(partial(_sleep_in_turn, naps)) == expected
 
 
-async def test_a_sleep_is_a_duration_and_survives_jumps() -> None:
-    clock = SimulatedClock()
+async def test_a_sleep_is_a_duration_and_survives_jumps(clock: SimulatedClock) -> None:
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(clock.sleep, 2.0))
         await clock.advance(1.0)
@@ -136,8 +134,7 @@ async def test_a_sleep_is_a_duration_and_survives_jumps() -> None:
         assert clock.now() == 51 * SECOND
 
 
-async def test_sleep_until_ends_when_a_jump_passes_its_stamp() -> None:
-    clock = SimulatedClock()
+async def test_sleep_until_ends_when_a_jump_passes_its_stamp(clock: SimulatedClock) -> None:
     async with anyio.create_task_group() as tasks:
         on_the_stamp = Asked(tasks, partial(clock.sleep_until, 5 * SECOND))
         later = Asked(tasks, partial(clock.sleep_until, 8 * SECOND))
@@ -153,8 +150,7 @@ async def test_sleep_until_ends_when_a_jump_passes_its_stamp() -> None:
         assert later.ended
 
 
-async def test_move_on_after_counts_simulated_time_across_jumps() -> None:
-    clock = SimulatedClock()
+async def test_move_on_after_counts_simulated_time_across_jumps(clock: SimulatedClock) -> None:
 
     async def wait() -> int:
         with clock.move_on_after(3.0) as scope:
@@ -216,8 +212,7 @@ async def test_sleeping_for_zero_seconds_passes_a_checkpoint(
     assert scope.cancelled_caught
 
 
-async def test_only_one_task_may_advance_a_clock_at_a_time() -> None:
-    clock = SimulatedClock()
+async def test_only_one_task_may_advance_a_clock_at_a_time(clock: SimulatedClock) -> None:
     async with anyio.create_task_group() as tasks:
         second = Asked(tasks, partial(clock.advance, 1.0))
         sleeper = Asked(tasks, partial(clock.sleep, 2.0))
@@ -227,8 +222,7 @@ async def test_only_one_task_may_advance_a_clock_at_a_time() -> None:
     assert clock.now() == 5 * SECOND
 
 
-async def test_a_cancelled_advance_stops_at_its_current_time_and_can_be_resumed() -> None:
-    clock = SimulatedClock()
+async def test_a_cancelled_advance_stops_at_its_current_time_and_can_be_resumed(clock: SimulatedClock) -> None:
 
     async def cancel_after_a_second() -> None:
         await clock.sleep(1.0)
@@ -243,8 +237,7 @@ async def test_a_cancelled_advance_stops_at_its_current_time_and_can_be_resumed(
         assert clock.now() == 2 * SECOND
 
 
-async def test_a_cancelled_sleeper_leaves_no_timer() -> None:
-    clock = SimulatedClock()
+async def test_a_cancelled_sleeper_leaves_no_timer(clock: SimulatedClock) -> None:
     async with anyio.create_task_group() as tasks:
         cancelled = [Asked(tasks, partial(clock.sleep, 1.0)), Asked(tasks, partial(clock.sleep_until, SECOND))]
         stays = Asked(tasks, partial(clock.sleep, 1.0))
@@ -360,8 +353,7 @@ def test_the_newest_due_tick_comes_at_once_and_older_ones_count_as_skipped(hz: f
     assert ticks.skipped == seen[-1] + 1 - len(seen)
 
 
-async def test_jumps_do_not_change_the_times_of_ticks() -> None:
-    clock = SimulatedClock()
+async def test_jumps_do_not_change_the_times_of_ticks(clock: SimulatedClock) -> None:
     beats = []
 
     async def beat() -> None:
@@ -391,8 +383,7 @@ def test_a_bad_rate_raises_when_the_ticks_are_made(
         make().ticks(hz)
 
 
-async def test_of_two_jumps_in_one_turn_the_first_decides_for_a_sleeper() -> None:
-    clock = SimulatedClock()
+async def test_of_two_jumps_in_one_turn_the_first_decides_for_a_sleeper(clock: SimulatedClock) -> None:
     for first, second in ((0, 30), (30, 0)):
         clock.set(10 * SECOND)
         async with anyio.create_task_group() as tasks:

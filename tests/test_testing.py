@@ -10,8 +10,7 @@ pytestmark = pytest.mark.anyio
 
 
 @pytest.mark.every_loop
-async def test_simulate_lets_time_pass_until_the_function_has_ended() -> None:
-    clock = SimulatedClock()
+async def test_simulate_lets_time_pass_until_the_function_has_ended(clock: SimulatedClock) -> None:
 
     async def nap() -> str:
         await clock.sleep(12.5)
@@ -38,8 +37,7 @@ async def test_simulate_raises_timeout_error_at_the_limit() -> None:
         await simulate(SimulatedClock(), lambda: anyio.Event().wait(), limit=60.0)
 
 
-async def test_simulate_can_be_cancelled_from_outside() -> None:
-    clock = SimulatedClock()
+async def test_simulate_can_be_cancelled_from_outside(clock: SimulatedClock) -> None:
 
     async def cancel_from_inside() -> None:
         scope.cancel()

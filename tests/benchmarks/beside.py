@@ -10,7 +10,7 @@ from typing import Any
 
 import cases
 import pytest
-from cases import AUTHORITY, Case, Vector
+from cases import AUTHORITY, BASE, START, Case, Vector
 from support.both_kernels import COMPILED, tfbus_on
 
 import tfbus
@@ -106,6 +106,11 @@ def build(samples: Iterable[cases.Sample], package: Any = tfbus) -> list[Transfo
         stamped(each.parent, each.child, each.stamp, transform(each.translation, each.rotation), AUTHORITY, each.static)
         for each in samples
     ]
+
+
+def samples_of(package: Any, child: str, count: int, parent: str = BASE) -> list[Any]:
+    stamps = range(START, START + count * cases.PERIOD, cases.PERIOD)
+    return [package.TransformStamped(parent, child, stamp, package.Transform(), AUTHORITY) for stamp in stamps]
 
 
 def tree_of(chain: str, package: Any = tfbus) -> TransformTree:

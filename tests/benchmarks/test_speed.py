@@ -3,8 +3,6 @@
 Timings on a shared machine drift, so what counts is the ratio of two sides that take turns. No test asserts a time.
 """
 
-import gc
-import tracemalloc
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from functools import partial
@@ -18,7 +16,7 @@ import anyio.lowlevel
 import cases
 import numpy as np
 import pytest
-from beside import ROUNDS, Ask, Table, Turn, build, last_of, name_of, show, take_turns, timed
+from beside import ROUNDS, Ask, Table, Turn, build, last_of, name_of, samples_of, show, take_turns, timed
 from cases import AUTHORITY, BASE, START, Case, Pass, Vector
 
 import tfbus
@@ -31,7 +29,6 @@ FEW_ROUNDS = 5
 HUNDRED = 100
 A_SECOND = 100_000
 """The number of samples that a hundred frames have in a second at 1 kHz."""
-WAKE_UPS = 200
 CROWD = 10_000
 
 Backend = tuple[str, dict[str, Any]]
@@ -134,7 +131,7 @@ def test_a_prefix(table: Table, depth: int) -> None:
     plain, local = Buffer(bus, 2 * cases.KEEP), Buffer(bus, 2 * cases.KEEP, prefix="r/")
     frames = [f"f{i}" for i in range(depth + 1)]
     for parent, child in pairwise(frames):
-        bus.publish([sample.replace(parent=f"r/{parent}", child=f"r/{child}") for sample in moving("a", HUNDRED)])
+        bus.publish(samples_of(tfbus, f"r/{child}", HUNDRED, f"r/{parent}"))
     stamps = [START + i * cases.PERIOD + 1 for i in range(HUNDRED - 1)]
 
     def asking(buffer: Buffer, prefix: str) -> Turn:
@@ -227,16 +224,20 @@ def moved(package: Any, data: Any, transform: Any) -> Callable[[], object]:
     return partial(package.do_transform, data, package.TransformStamped(BASE, "f", START, transform))
 
 
-@pytest.mark.parametrize(("points", "wanted"), [(100, "<= 2.5"), (1_000, "<= 1.4")])
-def test_clouds(table: Table, points: int, wanted: str) -> None:
-    positions = np.random.default_rng(1).normal(size=(points, 3))
+CLOUDS = [(100, np.float64, "<= 2.5"), (1_000, np.float64, "<= 1.4"), (100_000, np.float32, "<= 1.5")]
+
+
+@pytest.mark.parametrize(("points", "kind", "wanted"), CLOUDS)
+def test_clouds(table: Table, points: int, kind: Any, wanted: str) -> None:
+    positions = np.random.default_rng(1).normal(size=(points, 3)).astype(kind)
+    calls = max(1, 10_000 // points)
 
     def on(package: Any) -> Turn:
         call = moved(package, package.PointCloud("f", 0, positions), package.Transform((1.0, 2.0, 3.0)))
-        return timed(lambda: [call() for _ in range(HUNDRED)], HUNDRED)
+        return timed(lambda: [call() for _ in range(calls)], calls)
 
-    turn, shift = np.eye(3), np.array((1.0, 2.0, 3.0))
-    alone = timed(lambda: [positions @ turn + shift for _ in range(HUNDRED)], HUNDRED)
+    turn, shift = np.eye(3, dtype=kind), np.array((1.0, 2.0, 3.0), kind)
+    alone = timed(lambda: [positions @ turn + shift for _ in range(calls)], calls)
     table.measure(f"do_transform, a cloud of {points:,}", on, "numpy", alone, wanted)
 
 
@@ -349,67 +350,6 @@ def test_a_hundred_frames_in_each_batch(table: Table) -> None:
     table.add("100 frames at 1 kHz, built and published", share, wanted="<= 9 %")
 
 
-def moving(child: str, count: int) -> list[TransformStamped]:
-    return [TransformStamped(BASE, child, START + i * cases.PERIOD, Transform(), AUTHORITY) for i in range(count)]
-
-
-async def wake_up(
-    wait: Callable[[], Awaitable[object]], waiting: Callable[[], object], wake: Callable[[], object]
-) -> float:
-    """Seconds from the call of `wake` to the line after `wait`, in a task that was `waiting` by then."""
-    woken = 0.0
-
-    async def waiter() -> None:
-        nonlocal woken
-        await wait()
-        woken = perf_counter()
-
-    async with anyio.create_task_group() as group:
-        group.start_soon(waiter)
-        while not waiting():
-            await anyio.lowlevel.checkpoint()
-        start = perf_counter()
-        wake()
-    return woken - start
-
-
-WANTED = {"asyncio": ("<= 2.0", "<= 2.3"), "uvloop": ("<= 2.4", "<= 2.8"), "trio": ("<= 2.0", "<= 2.3")}
-"""The ratios of a wake-up without and with a timeout."""
-
-
-@pytest.mark.every_loop
-@pytest.mark.parametrize("timeout", [None, 60.0])
-def test_wake_up(table: Table, run: Run, anyio_backend: Backend, timeout: float | None) -> None:
-    bus = Bus()
-    buffer = Buffer(bus)
-    samples = iter(moving("a", 1 + ROUNDS * WAKE_UPS))
-    bus.publish(next(samples))
-
-    async def by_lookup() -> float:
-        sample = next(samples)
-        wait = partial(buffer.lookup, BASE, "a", sample.stamp, timeout=timeout)
-        return await wake_up(wait, buffer.pending, partial(bus.publish, sample))
-
-    async def by_event() -> float:
-        event = anyio.Event()
-        return await wake_up(event.wait, lambda: event.statistics().tasks_waiting, event.set)
-
-    lookups: list[float] = []
-    events: list[float] = []
-
-    async def take_turns() -> None:
-        for _ in range(ROUNDS):
-            pairs = [(await by_lookup(), await by_event()) for _ in range(WAKE_UPS)]
-            lookups.append(median(ours for ours, _ in pairs))
-            events.append(median(peer for _, peer in pairs))
-
-    run(take_turns)
-    name = name_of(anyio_backend)
-    with_timeout = timeout is not None
-    label = f"wake-up, {name}{', with a timeout' * with_timeout}"
-    table.compare(label, lookups, "Event", events, WANTED[name][with_timeout])
-
-
 @asynccontextmanager
 async def crowd(wait: Callable[[int], Any]) -> AsyncIterator[None]:
     """Ten thousand tasks that wait, until the end of the block cancels them."""
@@ -428,9 +368,9 @@ def look_up_a(buffer: Buffer, at: int) -> Awaitable[object]:
 def test_publishing_past_waiters(table: Table) -> None:
     buses = Bus(), Bus()
     buffer, _ = (Buffer(bus) for bus in buses)
-    samples = moving("b", 1 + ROUNDS * 2_000)
+    samples = samples_of(tfbus, "b", 1 + ROUNDS * 2_000)
     for bus in buses:
-        bus.publish([*moving("a", 1), samples[0]])
+        bus.publish([*samples_of(tfbus, "a", 1), samples[0]])
     rounds: list[list[float]] = []
 
     async def take_turns() -> None:
@@ -449,7 +389,7 @@ def test_publishing_past_waiters(table: Table) -> None:
 def test_cancelling(table: Table, run: Run, anyio_backend: Backend) -> None:
     bus = Bus()
     buffer = Buffer(bus)
-    bus.publish(moving("a", 1))
+    bus.publish(samples_of(tfbus, "a", 1))
     lookups: list[float] = []
     sleepers: list[float] = []
 
@@ -466,16 +406,3 @@ def test_cancelling(table: Table, run: Run, anyio_backend: Backend) -> None:
 
     run(take_turns)
     table.compare(f"cancel 10,000 waiters, {name_of(anyio_backend)}", lookups, "sleep", sleepers, unit="ms")
-
-
-def test_memory(table: Table) -> None:
-    chain = "m" * 20
-    bus = Bus()
-    buffer = Buffer(bus)
-    tracemalloc.start()
-    bus.publish(build(cases.history(chain)))
-    gc.collect()
-    size, _ = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert len(buffer.tree.frames()) == len(chain) + 1
-    table.add("memory a sample, 1,000 an edge", f"{size / len(chain) / 1_000:.0f} B")

@@ -1,7 +1,7 @@
 """The cost of waiting from the question to the answer, beside events and checkpoints of the same run.
 
-`test_speed.py` measures a wake-up alone. Here a task asks, is parked, is woken by a publish, and takes the answer; then
-it asks again. The turns of the loop and the publisher's checkpoints count on both sides. Times are of the processor.
+A task asks, is parked, is woken by a publish, and takes the answer; then it asks again. The turns of the loop and the
+publisher's checkpoints count on both sides. Times are of the processor.
 """
 
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -13,8 +13,8 @@ import anyio
 import anyio.lowlevel
 import cases
 import pytest
-from beside import Table, Turn, name_of, other_kernel, show, take_turns
-from cases import AUTHORITY, BASE, START
+from beside import Table, Turn, name_of, other_kernel, samples_of, show, take_turns
+from cases import BASE, START
 
 import tfbus
 
@@ -42,11 +42,6 @@ async def take_async_turns(sides: dict[str, AsyncTurn]) -> dict[str, list[float]
         for name, side in sides.items():
             rounds[name].append(await side())
     return rounds
-
-
-def samples_of(package: Any, child: str, count: int, first: int = 0, parent: str = BASE) -> list[Any]:
-    stamps = range(START + first * cases.PERIOD, START + (first + count) * cases.PERIOD, cases.PERIOD)
-    return [package.TransformStamped(parent, child, stamp, package.Transform(), AUTHORITY) for stamp in stamps]
 
 
 async def cycle(wait: Callable[[int], Awaitable[object]], wake: Callable[[int], object]) -> float:

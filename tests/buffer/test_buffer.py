@@ -45,8 +45,7 @@ def make(start: int = 0, keep: float | None = 10.0) -> tuple[SimulatedClock, Bus
 
 
 @pytest.mark.every_loop
-async def test_an_available_answer_is_returned_after_one_checkpoint() -> None:
-    _, bus, buffer = make()
+async def test_an_available_answer_is_returned_after_one_checkpoint(bus: Bus, buffer: Buffer) -> None:
     bus.publish([driving("map", "a", 1.0), driving("map", "a", 2.0)])
     turns = 0
 
@@ -68,8 +67,7 @@ async def test_an_available_answer_is_returned_after_one_checkpoint() -> None:
     assert (found.parent, found.child, found.stamp) == ("map", "a", 1_500_000_000)
 
 
-async def test_an_available_answer_passes_a_checkpoint() -> None:
-    _, bus, buffer = make()
+async def test_an_available_answer_passes_a_checkpoint(bus: Bus, buffer: Buffer) -> None:
     bus.publish(static("map", "a"))
     with anyio.CancelScope() as scope:
         scope.cancel()
@@ -107,9 +105,8 @@ async def test_an_invalid_name_raises_at_once(bad: str, ask: Callable[[str], tup
 )
 @pytest.mark.parametrize("target", ["map", "nowhere"])
 async def test_wrong_arguments_raise_at_once_for_known_and_unknown_frames(
-    target: str, arguments: dict[str, Any], error: type[Exception]
+    bus: Bus, buffer: Buffer, target: str, arguments: dict[str, Any], error: type[Exception]
 ) -> None:
-    _, bus, buffer = make()
     bus.publish(moving("map", "a", 1))
     with pytest.raises(error):
         await buffer.lookup(target, **{"source": "a", **arguments})
@@ -137,8 +134,7 @@ async def test_a_timeout_raises_with_the_last_error_as_its_cause() -> None:
 
 
 @pytest.mark.parametrize("timeout", [0.25, 4.999, 5.0, 5.001, 10.0, 3600.0])
-async def test_a_timeout_expires_on_the_clock_of_the_bus(timeout: float) -> None:
-    clock, _, buffer = make()
+async def test_a_timeout_expires_on_the_clock_of_the_bus(clock: SimulatedClock, buffer: Buffer, timeout: float) -> None:
 
     async def ask() -> int:
         with pytest.raises(TimeoutError):
@@ -177,6 +173,17 @@ async def test_a_sample_in_the_turn_in_which_the_timeout_expires_still_answers(
         assert asked.ended
         assert asked.answer.stamp == 5
     assert buffer.pending() == ()
+
+
+async def test_a_sample_between_the_wake_up_of_a_lookup_and_its_turn_counts() -> None:
+    _, bus, buffer = make()
+    bus.publish([moving("map", "a", 0), moving("a", "b", 0)])
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
+        await settle()
+        for sample in (moving("map", "a", 5, 1.0), moving("map", "a", 5, 2.0), moving("a", "b", 5)):
+            bus.publish(sample)
+    assert asked.answer.transform.translation == (2.0, 0.0, 0.0)
 
 
 async def test_fail_after_around_a_lookup_leaves_no_waiter() -> None:
@@ -310,9 +317,8 @@ async def test_a_jump_back_ends_every_wait_with_an_error_that_has_both_stamps() 
     ],
 )
 async def test_closing_ends_waits_and_buffered_samples_can_still_be_looked_up(
-    close: Callable[[Bus, Buffer], None], message: str
+    bus: Bus, buffer: Buffer, close: Callable[[Bus, Buffer], None], message: str
 ) -> None:
-    _, bus, buffer = make()
     bus.publish(driving("map", "a", 1))
     async with anyio.create_task_group() as tasks:
         asked = [Asked(tasks, partial(buffer.lookup, "map", source, 2 * SECOND)) for source in ("a", "nowhere")]
@@ -332,8 +338,7 @@ async def test_closing_ends_waits_and_buffered_samples_can_still_be_looked_up(
 
 
 @pytest.mark.parametrize("keep", [-1.0, math.nan])
-def test_a_buffer_with_a_bad_window_is_an_error_and_not_attached(keep: float) -> None:
-    bus = Bus(SimulatedClock())
+def test_a_buffer_with_a_bad_window_is_an_error_and_not_attached(bus: Bus, keep: float) -> None:
     with pytest.raises(ValueError, match="keep"):
         Buffer(bus, keep)
     bus.publish(moving("map", "a", 1))
@@ -343,8 +348,7 @@ def test_a_buffer_with_a_bad_window_is_an_error_and_not_attached(keep: float) ->
 # Data
 
 
-async def test_transform_waits_for_the_stamp_of_the_data() -> None:
-    _, bus, buffer = make()
+async def test_transform_waits_for_the_stamp_of_the_data(bus: Bus, buffer: Buffer) -> None:
     bus.publish(static("base", "laser", x=1.0))
     point = PointStamped("laser", 5 * SECOND, (2.0, 0.0, 0.0))
     with pytest.raises(UnknownFrameError):
@@ -357,8 +361,7 @@ async def test_transform_waits_for_the_stamp_of_the_data() -> None:
     assert buffer.transform_nowait(point, "map") == asked.answer
 
 
-async def test_transform_passes_timeout_and_max_age_on() -> None:
-    clock, bus, buffer = make()
+async def test_transform_passes_timeout_and_max_age_on(clock: SimulatedClock, bus: Bus, buffer: Buffer) -> None:
     bus.publish(driving("map", "base", 0))
     await clock.advance(9.0)
     point = PointStamped("base", LATEST, (0.0, 0.0, 0.0))
@@ -368,8 +371,7 @@ async def test_transform_passes_timeout_and_max_age_on() -> None:
         buffer.transform_nowait(point, "map", max_age=1.0)
 
 
-async def test_transform_moves_data_to_another_stamp_through_a_fixed_frame() -> None:
-    _, bus, buffer = make()
+async def test_transform_moves_data_to_another_stamp_through_a_fixed_frame(bus: Bus, buffer: Buffer) -> None:
     bus.publish([driving("map", "base", 1), driving("map", "base", 6), static("base", "laser", x=0.5)])
     # Seen at 2 s, at 3.5 m in map; at 5 s the base has driven 3 m on.
     point = PointStamped("laser", 2 * SECOND, (1.0, 0.0, 0.0))
@@ -441,9 +443,8 @@ SCAN = LaserScan("laser", 2, np.array([4.0]), angle_min=0.0, angle_increment=0.0
     ],
 )
 async def test_wrong_data_or_arguments_of_transform_raise_before_anything_is_awaited(
-    data: Any, arguments: dict[str, Any], message: str
+    buffer: Buffer, data: Any, arguments: dict[str, Any], message: str
 ) -> None:
-    _, _, buffer = make()
     with anyio.CancelScope() as scope:
         scope.cancel()
         with pytest.raises(TypeError, match=re.escape(message)):
@@ -516,8 +517,7 @@ async def test_whether_there_will_be_an_answer_can_be_awaited() -> None:
         await buffer.can_transform_within("map", "base", None, 7)
 
 
-async def test_an_infinite_timeout_never_expires() -> None:
-    clock, bus, buffer = make()
+async def test_an_infinite_timeout_never_expires(clock: SimulatedClock, bus: Bus, buffer: Buffer) -> None:
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", timeout=math.inf))
         await clock.advance(1e6)
@@ -527,8 +527,7 @@ async def test_an_infinite_timeout_never_expires() -> None:
         assert asked.answer.stamp == 7
 
 
-async def test_an_infinite_max_age_refuses_nothing() -> None:
-    clock, bus, buffer = make()
+async def test_an_infinite_max_age_refuses_nothing(clock: SimulatedClock, bus: Bus, buffer: Buffer) -> None:
     bus.publish(driving("map", "a", 0))
     await clock.advance(1e6)
     assert (await buffer.lookup("map", "a", max_age=math.inf)).stamp == 0

@@ -233,8 +233,7 @@ def test_latched_samples_of_the_bus_are_inserted_after_the_prefill() -> None:
 
 
 @pytest.mark.parametrize("keep", [10.0, 20.0])
-def test_the_counters_of_a_prefilled_buffer_start_with_samples_of_the_bus(keep: float) -> None:
-    bus = Bus(SimulatedClock())
+def test_the_counters_of_a_prefilled_buffer_start_with_samples_of_the_bus(bus: Bus, keep: float) -> None:
     first = Buffer(bus)
     bus.publish([*over("map", "a", range(10)), static("a", "laser")])
     late = Buffer(bus, keep, prefill=first)
@@ -247,8 +246,7 @@ def test_the_counters_of_a_prefilled_buffer_start_with_samples_of_the_bus(keep: 
     assert late.tree.edges() == first.tree.edges()
 
 
-def test_a_prefill_copies_bus_names_between_buffers_with_prefixes() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_prefill_copies_bus_names_between_buffers_with_prefixes(bus: Bus) -> None:
     first = Buffer(bus)
     bus.publish([moving("map", "robot1/base", 10, 3.0)])
     late = Buffer(bus, prefix="robot1/", shared={"map"}, prefill=first)
@@ -260,8 +258,7 @@ def test_a_prefill_copies_bus_names_between_buffers_with_prefixes() -> None:
 # Joining
 
 
-def test_a_buffer_prefilled_in_a_callback_has_the_current_batch_once() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_buffer_prefilled_in_a_callback_has_the_current_batch_once(bus: Bus) -> None:
     first = Buffer(bus)
     joined: list[Buffer] = []
     with bus.subscribe(lambda _: joined.append(Buffer(bus, prefill=first))):
@@ -272,8 +269,7 @@ def test_a_buffer_prefilled_in_a_callback_has_the_current_batch_once() -> None:
 
 
 @pytest.mark.parametrize("prefill", [5, "map", [moving("map", "a", 1)]])
-def test_a_prefill_that_is_no_buffer_or_tree_is_a_type_error(prefill: Any) -> None:
-    bus = Bus(SimulatedClock())
+def test_a_prefill_that_is_no_buffer_or_tree_is_a_type_error(bus: Bus, prefill: Any) -> None:
     with pytest.raises(TypeError, match="prefill"):
         Buffer(bus, prefill=prefill)
     assert bus.statistics().buffers == ()

@@ -69,9 +69,8 @@ def two_robots(start: int = 0) -> tuple[SimulatedClock, Bus, list[TransformBroad
 )
 @pytest.mark.parametrize("make", [partial(TransformBroadcaster), partial(Buffer)], ids=["broadcaster", "buffer"])
 def test_a_bad_prefix_is_an_error(
-    make: Callable[..., object], prefix: Any, shared: Any, error: type[Exception]
+    bus: Bus, make: Callable[..., object], prefix: Any, shared: Any, error: type[Exception]
 ) -> None:
-    bus = Bus(SimulatedClock())
     with pytest.raises(error):
         make(bus, prefix=prefix, shared=shared)
     assert bus.statistics().buffers == ()

@@ -278,26 +278,21 @@ async def test_under_a_hold_a_recent_sample_of_one_edge_satisfies_max_age() -> N
             await clock.advance(1.0)
 
 
-async def test_a_timeout_names_the_slack_of_the_policy() -> None:
-    clock = SimulatedClock()
-    with Bus(clock) as bus, Buffer(bus) as buffer:
-        bus.publish(driving("map", "base", 9.0))
-        async with anyio.create_task_group() as tasks:
-            asked: Asked[TransformStamped] = Asked(
-                tasks, partial(buffer.lookup, "map", "base", from_seconds(10.0), tolerance=0.2, timeout=1.0)
-            )
-            await clock.advance(1.0)
-        assert isinstance(asked.error, LookupTimeoutError)
-        assert isinstance(asked.error.__cause__, FutureExtrapolationError)
-        assert "asked for 10.000 s within 200 ms, newest sample is 9.000 s (1 s short)" in str(asked.error)
+async def test_a_timeout_names_the_slack_of_the_policy(clock: SimulatedClock, bus: Bus, buffer: Buffer) -> None:
+    bus.publish(driving("map", "base", 9.0))
+    async with anyio.create_task_group() as tasks:
+        asked: Asked[TransformStamped] = Asked(
+            tasks, partial(buffer.lookup, "map", "base", from_seconds(10.0), tolerance=0.2, timeout=1.0)
+        )
+        await clock.advance(1.0)
+    assert isinstance(asked.error, LookupTimeoutError)
+    assert isinstance(asked.error.__cause__, FutureExtrapolationError)
+    assert "asked for 10.000 s within 200 ms, newest sample is 9.000 s (1 s short)" in str(asked.error)
 
 
 async def test_a_long_wait_has_one_timer_for_the_next_log_line_however_often_its_cause_changes(
-    caplog: pytest.LogCaptureFixture,
+    clock: SimulatedClock, bus: Bus, buffer: Buffer, caplog: pytest.LogCaptureFixture
 ) -> None:
-    clock = SimulatedClock()
-    bus = Bus(clock)
-    buffer = Buffer(bus)
     bus.publish(driving("map", "base", 0.0))
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "arm", timeout=60.0))
@@ -313,30 +308,28 @@ async def test_a_long_wait_has_one_timer_for_the_next_log_line_however_often_its
 
 
 async def test_a_log_line_tells_of_the_lookups_that_have_waited_so_long_and_the_next_comes_five_seconds_later(
-    caplog: pytest.LogCaptureFixture,
+    clock: SimulatedClock, bus: Bus, buffer: Buffer, caplog: pytest.LogCaptureFixture
 ) -> None:
-    clock = SimulatedClock()
-    with Bus(clock) as bus, Buffer(bus) as buffer:
-        bus.publish(static("map", "base"))
-        async with anyio.create_task_group() as tasks:
-            asked = [Asked(tasks, partial(buffer.lookup, "map", name)) for name in ("a", "b")]
-            await clock.advance(1.0)
-            asked.append(Asked(tasks, partial(buffer.lookup, "map", "young")))
-            await clock.advance(8.9)
-            (message,) = caplog.messages
-            assert message.startswith("2 lookups have waited for more than 5 s: ")
-            assert "young" not in message
-            await clock.advance(0.1)
-            assert caplog.messages[1:] == [
-                "a lookup of 'young' in 'map' has waited for more than 5 s: frame 'young' is not known"
-            ]
-            # A jump back delays no line.
-            clock.set(SECOND)
-            await settle()
-            asked.append(Asked(tasks, partial(buffer.lookup, "map", "c")))
-            await clock.advance(5.0)
-            assert "'c'" in caplog.messages[-1]
-            asked[-1].cancel()
+    bus.publish(static("map", "base"))
+    async with anyio.create_task_group() as tasks:
+        asked = [Asked(tasks, partial(buffer.lookup, "map", name)) for name in ("a", "b")]
+        await clock.advance(1.0)
+        asked.append(Asked(tasks, partial(buffer.lookup, "map", "young")))
+        await clock.advance(8.9)
+        (message,) = caplog.messages
+        assert message.startswith("2 lookups have waited for more than 5 s: ")
+        assert "young" not in message
+        await clock.advance(0.1)
+        assert caplog.messages[1:] == [
+            "a lookup of 'young' in 'map' has waited for more than 5 s: frame 'young' is not known"
+        ]
+        # A jump back delays no line.
+        clock.set(SECOND)
+        await settle()
+        asked.append(Asked(tasks, partial(buffer.lookup, "map", "c")))
+        await clock.advance(5.0)
+        assert "'c'" in caplog.messages[-1]
+        asked[-1].cancel()
 
 
 async def test_on_the_loop_of_another_thread_a_lookup_has_an_answer_and_does_not_wait_for_one() -> None:
@@ -372,14 +365,13 @@ def test_on_trio_inside_a_task_of_asyncio_a_lookup_waits_on_trio() -> None:
 
 
 @pytest.mark.parametrize("ends", ["answered", "timed out", "cancelled", "closed"])
-async def test_a_lookup_that_has_waited_leaves_no_timer_and_no_waiter(ends: str) -> None:
-    clock = SimulatedClock()
-    bus = Bus(clock)
-    buffer = Buffer(bus)
+async def test_a_lookup_that_has_waited_leaves_no_timer_and_no_waiter(
+    clock: SimulatedClock, bus: Bus, buffer: Buffer, ends: str
+) -> None:
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "base", timeout=60.0))
         await settle()
-        assert "2 timers" in repr(clock), "one for the end, and one for the log line before it"
+        assert "2 timers" in repr(clock), "one for the end, and one for the log line before it, which all lookups share"
         if ends == "answered":
             bus.publish(driving("map", "base", 0.0))
         elif ends == "timed out":
@@ -389,6 +381,8 @@ async def test_a_lookup_that_has_waited_leaves_no_timer_and_no_waiter(ends: str)
         else:
             buffer.close()
     assert asked.ended
+    assert "0 timers" in repr(clock) or "1 timer>" in repr(clock)
+    await clock.advance(5.0)
     assert "0 timers" in repr(clock)
     assert buffer.pending() == ()
     assert bus.statistics().buffers == () or bus.statistics().buffers[0].waiting == 0

@@ -90,8 +90,7 @@ async def read_along(
 
 
 @pytest.mark.every_loop
-async def test_a_watch_starts_with_the_current_answer_and_then_gives_each_new_one() -> None:
-    _, bus, buffer = make()
+async def test_a_watch_starts_with_the_current_answer_and_then_gives_each_new_one(bus: Bus, buffer: Buffer) -> None:
     bus.publish([driving("map", "a", 1.0), driving("map", "a", 2.0)])
     samples = [driving("map", "a", second) for second in (3.0, 4.0, 5.0)]
     async with anyio.create_task_group() as tasks:
@@ -118,9 +117,8 @@ async def test_a_watch_starts_with_the_current_answer_and_then_gives_each_new_on
 )
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 async def test_min_rotation_is_the_angle_for_any_quaternion_signs(
-    before: float, after: float, angle: float, sign: float
+    bus: Bus, buffer: Buffer, before: float, after: float, angle: float, sign: float
 ) -> None:
-    _, bus, buffer = make()
     bus.publish(turned(before, 1))
     with (
         buffer.watch("map", "a", min_rotation=max(angle * (1 - 1e-6), 1e-9)) as reached,
@@ -205,8 +203,7 @@ async def test_a_clock_set_back_without_a_jump_delays_an_answer_by_at_most_one_p
 # Slow readers
 
 
-async def test_a_slow_reader_gets_the_newest_answer_and_skipped_updates_are_counted() -> None:
-    _, bus, buffer = make()
+async def test_a_slow_reader_gets_the_newest_answer_and_skipped_updates_are_counted(bus: Bus, buffer: Buffer) -> None:
     bus.publish(moving("map", "a", 0))
     with buffer.watch("map", "a") as changes:
         for stamp in range(1, 11):
@@ -282,8 +279,7 @@ async def test_a_watch_gives_answers_again_after_one_that_was_too_old() -> None:
     assert changes.skipped == 0
 
 
-async def test_a_gap_delays_answers_until_the_lagging_edge_is_past_it() -> None:
-    _, bus, buffer = make()
+async def test_a_gap_delays_answers_until_the_lagging_edge_is_past_it(bus: Bus, buffer: Buffer) -> None:
     samples = [moving("map", "a", 10), moving("a", "b", 10), moving("a", "b", 20), moving("a", "b", 30)]
     with buffer.watch("map", "b", max_gap=10e-9) as strict, buffer.watch("map", "b", max_gap=9e-9) as stricter:
         async with anyio.create_task_group() as tasks:
@@ -302,8 +298,7 @@ async def test_a_gap_delays_answers_until_the_lagging_edge_is_past_it() -> None:
 
 
 @pytest.mark.parametrize("end", ["buffer", "bus"])
-async def test_a_watch_of_a_closed_buffer_gives_the_current_answer_and_ends(end: str) -> None:
-    _, bus, buffer = make()
+async def test_a_watch_of_a_closed_buffer_gives_the_current_answer_and_ends(bus: Bus, buffer: Buffer, end: str) -> None:
     bus.publish(moving("map", "a", 1))
     (buffer if end == "buffer" else bus).close()
     assert [answer.stamp async for answer in buffer.watch("map", "a")] == [1]
@@ -334,21 +329,21 @@ async def test_a_jump_back_gives_a_static_answer_again_and_a_jump_forward_does_n
 # Cancellation, readers and threads
 
 
-async def test_a_second_reader_is_busy_and_the_first_continues() -> None:
-    _, bus, buffer = make()
+async def test_a_second_reader_is_busy_and_the_first_continues(bus: Bus, buffer: Buffer) -> None:
     async with anyio.create_task_group() as tasks:
         with buffer.watch("map", "a") as changes:
             first = Asked(tasks, changes.__anext__)
             await settle()
             with pytest.raises(anyio.BusyResourceError):
                 await anext(changes)
+            with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+                await anyio.to_thread.run_sync(changes.close)
             bus.publish(moving("map", "a", 1))
             await settle()
             assert first.answer.stamp == 1
 
 
-async def test_an_available_answer_passes_a_checkpoint() -> None:
-    _, bus, buffer = make()
+async def test_an_available_answer_passes_a_checkpoint(bus: Bus, buffer: Buffer) -> None:
     bus.publish(moving("map", "a", 1))
     with buffer.watch("map", "a") as changes:
         with anyio.CancelScope() as scope:
@@ -358,8 +353,7 @@ async def test_an_available_answer_passes_a_checkpoint() -> None:
         assert (await anext(changes)).stamp == 1
 
 
-def test_timeouts_and_cancellation_of_asyncio_work_with_a_watch() -> None:
-    _, bus, buffer = make()
+def test_timeouts_and_cancellation_of_asyncio_work_with_a_watch(bus: Bus, buffer: Buffer) -> None:
 
     async def main() -> None:
         with buffer.watch("map", "a") as changes:
@@ -385,19 +379,15 @@ def test_timeouts_and_cancellation_of_asyncio_work_with_a_watch() -> None:
     ("arguments", "error", "message"),
     [
         ({"min_translation": -1.0}, ValueError, "min_translation must be from 0 to inf m, got -1.0"),
-        ({"min_translation": math.nan}, ValueError, "min_translation"),
         ({"min_translation": "1"}, TypeError, "min_translation must be a number in m, not '1'"),
-        ({"min_translation": True}, TypeError, "min_translation"),
         ({"min_rotation": -0.1}, ValueError, "min_rotation"),
         ({"min_rotation": 5.0}, ValueError, "min_rotation must be from 0 to 3.142 rad, got 5.0"),
         ({"min_rotation": None}, TypeError, "min_rotation"),
         ({"max_rate": 0.0}, ValueError, "max_rate"),
-        ({"max_rate": -1.0}, ValueError, "max_rate"),
         ({"max_rate": math.inf}, ValueError, "max_rate"),
         ({"max_rate": math.nan}, ValueError, "max_rate"),
         ({"max_rate": "10"}, TypeError, "max_rate must be a number in Hz, not '10'"),
         ({"max_age": -1.0}, ValueError, "max_age"),
-        ({"max_age": "1"}, TypeError, "max_age"),
         ({"tolerance": -1.0}, ValueError, "tolerance"),
         ({"max_gap": "1"}, TypeError, "max_gap"),
         ({"extrapolate": 1.0}, TypeError, "extrapolate"),
@@ -407,16 +397,14 @@ def test_timeouts_and_cancellation_of_asyncio_work_with_a_watch() -> None:
     ],
 )
 def test_a_wrong_argument_raises_when_the_watch_is_made(
-    arguments: dict[str, Any], error: type[Exception], message: str
+    buffer: Buffer, arguments: dict[str, Any], error: type[Exception], message: str
 ) -> None:
-    _, _, buffer = make()
     with pytest.raises(error, match=message):
         buffer.watch(**{"target": "map", "source": "a", **arguments})
     assert buffer.pending() == ()
 
 
-async def test_of_two_thresholds_one_is_enough_and_zero_means_no_threshold() -> None:
-    _, bus, buffer = make()
+async def test_of_two_thresholds_one_is_enough_and_zero_means_no_threshold(bus: Bus, buffer: Buffer) -> None:
     samples = [
         turned(0.0, 0),
         turned(0.9, 1, x=0.9),
@@ -455,8 +443,7 @@ async def test_a_watch_without_an_answer_waits_and_is_pending() -> None:
             assert (reader.stamps, buffer.pending()) == ([2], ())
 
 
-async def test_a_policy_allows_answers_with_their_extrapolation() -> None:
-    _, bus, buffer = make()
+async def test_a_policy_allows_answers_with_their_extrapolation(bus: Bus, buffer: Buffer) -> None:
     bus.publish([moving("map", "a", 10, 1.0), moving("a", "b", 12, 2.0)])
     with (
         buffer.watch("map", "b", tolerance=2e-9) as near,

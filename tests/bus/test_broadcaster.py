@@ -46,8 +46,7 @@ def test_send_all_stamps_all_transforms_alike_and_keeps_the_stamps_of_samples() 
     assert got[1][0].stamp == 50
 
 
-def test_send_static_holds_at_every_stamp_and_can_be_repeated() -> None:
-    bus = Bus(SimulatedClock())
+def test_send_static_holds_at_every_stamp_and_can_be_repeated(bus: Bus) -> None:
     broadcaster = TransformBroadcaster(bus)
     broadcaster.send_static("base", "laser", HERE)
     broadcaster.send_static("base", "laser", HERE.inverse())
@@ -83,10 +82,8 @@ MISTAKES: dict[str, Callable[[TransformBroadcaster], None]] = {
     + [pytest.param(call, TypeError, id=name) for name, call in MISTAKES.items()],
 )
 def test_bad_input_raises_stores_nothing_and_leaves_the_bus_usable(
-    call: Callable[[TransformBroadcaster], None], error: type[Exception]
+    bus: Bus, buffer: Buffer, call: Callable[[TransformBroadcaster], None], error: type[Exception]
 ) -> None:
-    bus = Bus(SimulatedClock())
-    buffer = Buffer(bus)
     got: list[tuple[TransformStamped, ...]] = []
     broadcaster = TransformBroadcaster(bus)
     broadcaster.send("map", "base", HERE)
@@ -105,9 +102,7 @@ def test_bad_input_raises_stores_nothing_and_leaves_the_bus_usable(
 # Owning
 
 
-def test_an_owned_frame_is_reserved_in_the_block_and_removed_at_its_end() -> None:
-    bus = Bus(SimulatedClock())
-    buffer = Buffer(bus)
+def test_an_owned_frame_is_reserved_in_the_block_and_removed_at_its_end(bus: Bus, buffer: Buffer) -> None:
     arm, other = TransformBroadcaster(bus, "arm"), TransformBroadcaster(bus, "other")
     with arm.owning("tool0", "tool1"):
         for name in ("tool0", "tool1"):
@@ -123,8 +118,7 @@ def test_an_owned_frame_is_reserved_in_the_block_and_removed_at_its_end() -> Non
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, GeneratorExit])
-def test_an_error_in_the_block_removes_the_owned_frame(error: type[BaseException]) -> None:
-    bus = Bus(SimulatedClock())
+def test_an_error_in_the_block_removes_the_owned_frame(bus: Bus, error: type[BaseException]) -> None:
     arm = TransformBroadcaster(bus, "arm")
     with pytest.raises(error), arm.owning("tool0"):
         arm.send_static("flange", "tool0", HERE)
@@ -133,8 +127,7 @@ def test_an_error_in_the_block_removes_the_owned_frame(error: type[BaseException
     bus.reserve("tool0", "other").close()
 
 
-def test_an_owned_frame_may_be_unpublished_or_already_removed_at_the_end() -> None:
-    bus = Bus(SimulatedClock())
+def test_an_owned_frame_may_be_unpublished_or_already_removed_at_the_end(bus: Bus) -> None:
     arm = TransformBroadcaster(bus, "arm")
     with arm.owning("tool0", "tool1", "tool2"):
         arm.send_static("flange", "tool1", HERE)
@@ -143,9 +136,7 @@ def test_an_owned_frame_may_be_unpublished_or_already_removed_at_the_end() -> No
     assert bus.statistics().frames == 0
 
 
-def test_the_bus_may_be_closed_before_the_block_of_owning_ends() -> None:
-    bus = Bus(SimulatedClock())
-    buffer = Buffer(bus)
+def test_the_bus_may_be_closed_before_the_block_of_owning_ends(bus: Bus, buffer: Buffer) -> None:
     arm = TransformBroadcaster(bus, "arm")
     with arm.owning("tool0"):
         arm.send_static("flange", "tool0", HERE)
@@ -153,8 +144,7 @@ def test_the_bus_may_be_closed_before_the_block_of_owning_ends() -> None:
     assert buffer.can_transform("flange", "tool0"), "nothing changes any more on a closed bus"
 
 
-def test_of_several_frames_all_are_reserved_or_none() -> None:
-    bus = Bus(SimulatedClock())
+def test_of_several_frames_all_are_reserved_or_none(bus: Bus) -> None:
     arm, other = TransformBroadcaster(bus, "arm"), TransformBroadcaster(bus, "other")
     arm.send_static("flange", "tool0", HERE)
     block = arm.owning("tool0", "tool1")

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.asking import Asked, driving, settle
-from support.samples import any_samples, edges_of, moving, static
+from support.samples import any_samples, edges_of, latched, moving, static
 
 from tfbus import (
     SECOND,
@@ -135,9 +135,7 @@ def test_the_greatest_number_of_frames_is_an_int_of_at_least_two(most: Any, kind
         Bus(max_frames=most)
 
 
-def test_a_batch_with_a_loop_of_parents_is_refused_whole_and_the_error_names_the_loop() -> None:
-    bus = Bus(SimulatedClock())
-    buffer = Buffer(bus)
+def test_a_batch_with_a_loop_of_parents_is_refused_whole_and_the_error_names_the_loop(bus: Bus, buffer: Buffer) -> None:
     got: list[Batch] = []
     bus.subscribe(got.append)
     bus.publish([moving("map", "odom", 1), moving("odom", "base", 1)])
@@ -170,9 +168,7 @@ def test_drop_leaves_out_only_the_rejected_samples_and_logs_them_once(caplog: py
 
 
 @pytest.mark.parametrize("nonsense", [None, 5, "map", b"map", [moving("map", "a", 1), None], ["map"], {"map": 1}])
-def test_a_batch_with_an_object_that_is_no_sample_is_refused_whole(nonsense: object) -> None:
-    bus = Bus(SimulatedClock())
-    buffer = Buffer(bus)
+def test_a_batch_with_an_object_that_is_no_sample_is_refused_whole(bus: Bus, buffer: Buffer, nonsense: object) -> None:
     with pytest.raises(TypeError, match="TransformStamped"):
         bus.publish(nonsense)  # type: ignore[arg-type]
     assert buffer.tree.frames() == []
@@ -183,8 +179,7 @@ def test_a_batch_with_an_object_that_is_no_sample_is_refused_whole(nonsense: obj
 # Topology
 
 
-def test_removing_a_frame_reads_no_other_frame() -> None:
-    bus = Bus(SimulatedClock())
+def test_removing_a_frame_reads_no_other_frame(bus: Bus) -> None:
     with Buffer(bus), bus.stream(), bus.events():
         bus.publish(moving("map", f"frame {number}", 1) for number in range(2_000))
         visited = 0
@@ -249,9 +244,7 @@ def test_each_jump_back_is_logged(caplog: pytest.LogCaptureFixture) -> None:
 # The end
 
 
-async def test_closing_ends_waiting_lookups_and_streams_and_buffers_still_answer() -> None:
-    bus = Bus(SimulatedClock())
-    buffer = Buffer(bus)
+async def test_closing_ends_waiting_lookups_and_streams_and_buffers_still_answer(bus: Bus, buffer: Buffer) -> None:
     bus.publish(driving("map", "a", 1.0))
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", 2_000_000_000))
@@ -297,10 +290,9 @@ def test_a_closed_bus_refuses_samples_and_registrations(
 # Loops
 
 
-def test_bus_objects_may_be_made_before_a_loop_and_used_on_several_loops(run: Run) -> None:
-    clock = SimulatedClock()
-    bus = Bus(clock)
-    buffer = Buffer(bus)
+def test_bus_objects_may_be_made_before_a_loop_and_used_on_several_loops(
+    clock: SimulatedClock, bus: Bus, buffer: Buffer, run: Run
+) -> None:
     broadcaster = TransformBroadcaster(bus)
     got: list[Batch] = []
     bus.subscribe(got.append)
@@ -341,6 +333,9 @@ def test_statistics_count_everything_on_the_bus() -> None:
     assert counted.queues == (QueueStatistics("stream", "conflate", capacity=7, pending=2, dropped=0),)
     buffer.close()
     assert bus.statistics().buffers == ()
+    for again in (static("map", "a"), moving("map", "a", 3)):
+        bus.publish(again)
+    assert (bus.statistics().kind_changes, [*latched(bus)]) == (2, ["s"])
 
 
 @pytest.mark.thorough

@@ -153,13 +153,12 @@ def test_a_bad_row_is_named_and_nothing_is_stored_or_only_it_is_dropped(
     assert len(caplog.records) == 1
 
 
-def test_a_refusal_of_the_bus_stores_nothing_of_the_columns() -> None:
-    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
-        with pytest.raises(InvalidTransformError, match="loop"):
-            bus.publish_columns(["a", "b"], ["b", "a"], 0, np.zeros((2, 3)), [STILL] * 2)
-        assert buffer.tree.frames() == []
-        with pytest.raises(ValueError, match="invalid must be"):
-            bus.publish_columns("map", "a", 0, np.zeros((1, 3)), [STILL], invalid="ignore")  # type: ignore[arg-type]
+def test_a_refusal_of_the_bus_stores_nothing_of_the_columns(bus: Bus, buffer: Buffer) -> None:
+    with pytest.raises(InvalidTransformError, match="loop"):
+        bus.publish_columns(["a", "b"], ["b", "a"], 0, np.zeros((2, 3)), [STILL] * 2)
+    assert buffer.tree.frames() == []
+    with pytest.raises(ValueError, match="invalid must be"):
+        bus.publish_columns("map", "a", 0, np.zeros((1, 3)), [STILL], invalid="ignore")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -210,34 +209,32 @@ def test_later_changes_of_the_arrays_change_no_sample() -> None:
     assert tree.lookup("map", "a", 2).transform.translation == (1.0, 0.0, 0.0)
 
 
-def test_a_broadcaster_sends_columns_under_its_names() -> None:
-    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
-        robot = TransformBroadcaster(bus, "driver", prefix="r/", shared={"map"}, invalid="drop")
-        robot.send_columns("map", ["a", "b"], [[1.0, 0.0, 0.0], [np.nan, 0.0, 0.0]], [STILL] * 2)
-        robot.send_columns("map", "a", [[2.0, 0.0, 0.0]], [STILL], at=[5])
-        assert buffer.tree.frames() == ["map", "r/a"]
-        assert [edge.authority for edge in buffer.tree.edges()] == ["driver"]
-        assert buffer.lookup_nowait("map", "r/a", 5).transform.translation == (2.0, 0.0, 0.0)
+def test_a_broadcaster_sends_columns_under_its_names(bus: Bus, buffer: Buffer) -> None:
+    robot = TransformBroadcaster(bus, "driver", prefix="r/", shared={"map"}, invalid="drop")
+    robot.send_columns("map", ["a", "b"], [[1.0, 0.0, 0.0], [np.nan, 0.0, 0.0]], [STILL] * 2)
+    robot.send_columns("map", "a", [[2.0, 0.0, 0.0]], [STILL], at=[5])
+    assert buffer.tree.frames() == ["map", "r/a"]
+    assert [edge.authority for edge in buffer.tree.edges()] == ["driver"]
+    assert buffer.lookup_nowait("map", "r/a", 5).transform.translation == (2.0, 0.0, 0.0)
 
 
 @pytest.mark.anyio
-async def test_columns_wake_the_lookups_that_waited_for_a_row() -> None:
+async def test_columns_wake_the_lookups_that_waited_for_a_row(bus: Bus, buffer: Buffer) -> None:
     found: list[TransformStamped] = []
-    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
-        bus.publish_columns("map", ["a", "b"], 0, np.zeros((2, 3)), [STILL] * 2)
+    bus.publish_columns("map", ["a", "b"], 0, np.zeros((2, 3)), [STILL] * 2)
 
-        async def wait_for(frame: str, stamp: int) -> None:
-            found.append(await buffer.lookup("map", frame, stamp))
+    async def wait_for(frame: str, stamp: int) -> None:
+        found.append(await buffer.lookup("map", frame, stamp))
 
-        async with anyio.create_task_group() as tasks:
-            for frame, stamp in (("a", 2), ("a", 3), ("b", 2), ("c", 1)):
-                tasks.start_soon(wait_for, frame, stamp)
-            await anyio.wait_all_tasks_blocked()
-            bus.publish_columns(**three_rows({}))
-            await anyio.wait_all_tasks_blocked()
-            assert sorted((answer.stamp, answer.transform.translation[0]) for answer in found) == [(2, 1.0), (3, 2.0)]
-            bus.publish_columns("map", ["b", "c"], [2, 1], np.ones((2, 3)), [STILL] * 2)
-        assert {(answer.child, answer.stamp) for answer in found[2:]} == {("b", 2), ("c", 1)}
+    async with anyio.create_task_group() as tasks:
+        for frame, stamp in (("a", 2), ("a", 3), ("b", 2), ("c", 1)):
+            tasks.start_soon(wait_for, frame, stamp)
+        await anyio.wait_all_tasks_blocked()
+        bus.publish_columns(**three_rows({}))
+        await anyio.wait_all_tasks_blocked()
+        assert sorted((answer.stamp, answer.transform.translation[0]) for answer in found) == [(2, 1.0), (3, 2.0)]
+        bus.publish_columns("map", ["b", "c"], [2, 1], np.ones((2, 3)), [STILL] * 2)
+    assert {(answer.child, answer.stamp) for answer in found[2:]} == {("b", 2), ("c", 1)}
 
 
 def test_a_closed_bus_and_a_tree_of_a_bus_take_no_columns() -> None:

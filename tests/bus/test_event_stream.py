@@ -17,7 +17,6 @@ from tfbus import (
     PastLoop,
     QueueStatistics,
     SampleRejected,
-    SimulatedClock,
     StampAhead,
 )
 from tfbus.bus.event_stream import EventQueue
@@ -27,8 +26,7 @@ pytestmark = pytest.mark.anyio
 ENDS: list[Callable[[Bus, EventStream], None]] = [lambda bus, _: bus.close(), lambda _, events: events.close()]
 
 
-async def test_events_that_a_slow_reader_misses_are_counted_in_the_statistics() -> None:
-    bus = Bus(SimulatedClock())
+async def test_events_that_a_slow_reader_misses_are_counted_in_the_statistics(bus: Bus) -> None:
     with bus.events(capacity=2) as events:
         bus.publish([static("map", name) for name in "abcde"])
         assert bus.statistics().queues == (QueueStatistics("events", "drop_oldest", 2, pending=2, dropped=3),)
@@ -45,8 +43,7 @@ async def test_events_that_a_slow_reader_misses_are_counted_in_the_statistics() 
 # The end
 
 
-async def test_the_error_of_a_rejection_event_has_no_traceback_into_the_sender() -> None:
-    bus = Bus(SimulatedClock())
+async def test_the_error_of_a_rejection_event_has_no_traceback_into_the_sender(bus: Bus) -> None:
     bus.publish(static("a", "b"))
     with bus.events() as events:
         with pytest.raises(InvalidTransformError) as caught:
@@ -59,8 +56,7 @@ async def test_the_error_of_a_rejection_event_has_no_traceback_into_the_sender()
         assert rejected.error.__traceback__ is None
 
 
-async def test_rejected_objects_that_are_no_samples_are_events() -> None:
-    bus = Bus(SimulatedClock())
+async def test_rejected_objects_that_are_no_samples_are_events(bus: Bus) -> None:
     with bus.events() as events:
         bus.publish(["noise", moving("map", "a", 1)], invalid="drop")  # type: ignore[list-item]
         rejected = await anext(events)
@@ -72,8 +68,7 @@ async def test_rejected_objects_that_are_no_samples_are_events() -> None:
 # Loops and threads
 
 
-async def test_another_thread_may_not_touch_the_events_of_a_bus_in_use() -> None:
-    bus = Bus(SimulatedClock())
+async def test_another_thread_may_not_touch_the_events_of_a_bus_in_use(bus: Bus) -> None:
     bus.publish(static("map", "a"))
     with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
         await anyio.to_thread.run_sync(anyio.run, bus.events().__anext__)
@@ -88,8 +83,7 @@ async def test_another_thread_may_not_touch_the_events_of_a_bus_in_use() -> None
 
 
 @pytest.mark.parametrize("bad", [{"capacity": 0}, {"stale_after": -1.0}, {"stale_after": math.nan}])
-def test_a_stream_with_a_bad_capacity_or_limit_is_not_registered(bad: dict[str, float]) -> None:
-    bus = Bus(SimulatedClock())
+def test_a_stream_with_a_bad_capacity_or_limit_is_not_registered(bus: Bus, bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"capacity|stale_after"):
         bus.events(**bad)  # type: ignore[arg-type]
     assert bus.statistics().queues == ()

@@ -17,8 +17,7 @@ from tfbus import (
 )
 
 
-def test_reserving_a_frame_of_another_authority_is_an_error_that_names_both() -> None:
-    bus = Bus(SimulatedClock())
+def test_reserving_a_frame_of_another_authority_is_an_error_that_names_both(bus: Bus) -> None:
     with bus.reserve("b", ""):
         with pytest.raises(InvalidTransformError) as caught:
             bus.reserve("b", "odometry")
@@ -28,8 +27,7 @@ def test_reserving_a_frame_of_another_authority_is_an_error_that_names_both() ->
     bus.reserve("b", "odometry").close()
 
 
-def test_reserving_a_bad_name_or_for_a_bad_authority_is_an_error() -> None:
-    bus = Bus(SimulatedClock())
+def test_reserving_a_bad_name_or_for_a_bad_authority_is_an_error(bus: Bus) -> None:
     for name in ("", "/odom"):
         with pytest.raises(InvalidTransformError, match="frame name"):
             bus.reserve(name, "slam")
@@ -70,8 +68,7 @@ def test_an_edge_that_was_there_first_is_removed_when_the_owner_publishes(caplog
     )
 
 
-def test_of_several_edges_of_others_the_one_that_was_published_last_is_removed() -> None:
-    bus = Bus(SimulatedClock())
+def test_of_several_edges_of_others_the_one_that_was_published_last_is_removed(bus: Bus) -> None:
     TransformBroadcaster(bus, "urdf").send_static("base", "tool", Transform())
     stranger = TransformBroadcaster(bus, "stranger")
     stranger.send("earth", "map", Transform())
@@ -90,8 +87,7 @@ def test_of_several_edges_of_others_the_one_that_was_published_last_is_removed()
 
 @pytest.mark.parametrize("last", ["a", "map"])
 @pytest.mark.parametrize("elsewhere", [False, True])
-def test_of_two_edges_of_others_the_one_that_came_last_is_removed(last: str, elsewhere: bool) -> None:
-    bus = Bus(SimulatedClock())
+def test_of_two_edges_of_others_the_one_that_came_last_is_removed(bus: Bus, last: str, elsewhere: bool) -> None:
     if elsewhere:
         bus.publish([moving("x", "a", 0, authority="one"), moving("x", "map", 0, authority="two")])
     edges = {"a": moving("base", "a", 0, authority="one"), "map": moving("a", "map", 0, authority="two")}
@@ -100,6 +96,14 @@ def test_of_two_edges_of_others_the_one_that_came_last_is_removed(last: str, els
     with bus.reserve("base", "owner"):
         TransformBroadcaster(bus, "owner").send("map", "base", Transform())
     assert {event.frame for event in edges_of(bus)} == {"base", "a", "map"} - {last}
+
+
+def test_of_one_batch_the_edge_of_the_other_is_left_out() -> None:
+    bus = Bus(SimulatedClock())
+    batch = [moving("base", "map", 1, authority="stranger"), moving("map", "base", 1, authority="owner")]
+    with bus.reserve("base", "owner"):
+        bus.publish(batch, invalid="drop")
+    assert [event.frame for event in edges_of(bus)] == ["base"]
 
 
 def test_a_batch_that_is_refused_for_another_reason_removes_nothing() -> None:

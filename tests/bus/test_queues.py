@@ -26,8 +26,7 @@ async def read(stream: Stream, batches: Batches) -> None:
 
 
 @pytest.mark.every_loop
-async def test_a_stream_gives_whole_batches_in_order() -> None:
-    bus = Bus(SimulatedClock())
+async def test_a_stream_gives_whole_batches_in_order(bus: Bus) -> None:
     sent = [(moving("map", "a", k), moving("a", "b", k)) for k in range(20)]
     got: Batches = []
     async with anyio.create_task_group() as tasks:
@@ -44,8 +43,7 @@ async def test_a_stream_gives_whole_batches_in_order() -> None:
 
 
 @pytest.mark.parametrize("overflow", OVERFLOWS)
-async def test_a_late_stream_gives_the_latched_static_samples_first(overflow: Overflow) -> None:
-    bus = Bus(SimulatedClock())
+async def test_a_late_stream_gives_the_latched_static_samples_first(bus: Bus, overflow: Overflow) -> None:
     bus.publish([static("map", "a"), static("map", "b", x=1.0), moving("map", "c", 1)])
     bus.publish(static("map", "b", x=2.0))
     with bus.stream(overflow=overflow) as stream:
@@ -57,9 +55,8 @@ async def test_a_late_stream_gives_the_latched_static_samples_first(overflow: Ov
 @pytest.mark.parametrize("overflow", OVERFLOWS)
 @pytest.mark.parametrize("end", [lambda bus, _: bus.close(), lambda _, stream: stream.close()])
 async def test_a_closed_stream_ends_after_the_pending_batches(
-    end: Callable[[Bus, Stream], None], overflow: Overflow
+    bus: Bus, end: Callable[[Bus, Stream], None], overflow: Overflow
 ) -> None:
-    bus = Bus(SimulatedClock())
     stream = bus.stream(overflow=overflow)
     bus.publish(moving("map", "a", 1))
     end(bus, stream)
@@ -70,8 +67,7 @@ async def test_a_closed_stream_ends_after_the_pending_batches(
         await anext(stream)
 
 
-async def test_a_stream_may_be_closed_in_a_callback_of_the_bus() -> None:
-    bus = Bus(SimulatedClock())
+async def test_a_stream_may_be_closed_in_a_callback_of_the_bus(bus: Bus) -> None:
     with bus.stream() as closing, bus.stream() as staying, bus.subscribe(lambda _: closing.close()):
         bus.publish(moving("map", "a", 1))
         bus.publish(moving("map", "b", 2))
@@ -104,9 +100,8 @@ async def test_a_jump_back_discards_pending_moving_samples(overflow: Overflow) -
     ],
 )
 def test_a_stream_with_a_bad_capacity_or_overflow_is_not_registered(
-    capacity: int, overflow: Overflow, error: type[Exception]
+    bus: Bus, capacity: int, overflow: Overflow, error: type[Exception]
 ) -> None:
-    bus = Bus(SimulatedClock())
     with pytest.raises(error, match=r"capacity|overflow"):
         bus.stream(capacity, overflow)
     bus.publish(moving("map", "a", 1))

@@ -21,8 +21,7 @@ def noting(bus: Bus, log: list[object]) -> Registration:
     return bus.subscribe(lambda batch: log.append([sample.child for sample in batch]), log.append)
 
 
-def test_a_subscriber_gets_each_batch_as_a_tuple_until_it_is_closed() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_subscriber_gets_each_batch_as_a_tuple_until_it_is_closed(bus: Bus) -> None:
     got: list[Batch] = []
     with bus.subscribe(got.append):
         bus.publish(moving("map", "a", 1))
@@ -31,8 +30,7 @@ def test_a_subscriber_gets_each_batch_as_a_tuple_until_it_is_closed() -> None:
     assert got == [(moving("map", "a", 1),), (moving("map", "a", 2), moving("map", "b", 2))]
 
 
-def test_buffers_have_a_batch_before_subscribers_are_called() -> None:
-    bus = Bus(SimulatedClock())
+def test_buffers_have_a_batch_before_subscribers_are_called(bus: Bus) -> None:
     stamps = []
     bus.subscribe(lambda _: stamps.append(buffer.lookup_nowait("map", "a").stamp))
     buffer = Buffer(bus)
@@ -41,8 +39,7 @@ def test_buffers_have_a_batch_before_subscribers_are_called() -> None:
     assert stamps == [1, 2]
 
 
-def test_a_late_subscriber_gets_the_latched_static_samples_first() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_late_subscriber_gets_the_latched_static_samples_first(bus: Bus) -> None:
     bus.publish([static("map", "a"), static("map", "b"), moving("map", "c", 1)])
     bus.publish(static("map", "b", x=2.0))
     got: list[Batch] = []
@@ -79,8 +76,7 @@ def test_an_exception_of_a_callback_is_isolated_announced_and_logged_once(caplog
     assert str(record.exc_info[1]) == "spilt the coffee"
 
 
-def test_a_base_exception_of_a_subscriber_is_raised_and_the_bus_stays_usable() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_base_exception_of_a_subscriber_is_raised_and_the_bus_stays_usable(bus: Bus) -> None:
     got: list[Batch] = []
 
     def interrupted(batch: Batch) -> None:
@@ -95,8 +91,7 @@ def test_a_base_exception_of_a_subscriber_is_raised_and_the_bus_stays_usable() -
     assert [batch[0].stamp for batch in got] == [1, 2]
 
 
-def test_a_subscriber_that_another_one_closes_is_no_longer_called() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_subscriber_that_another_one_closes_is_no_longer_called(bus: Bus) -> None:
     got: list[Batch] = []
     bus.subscribe(lambda _: victim.close())
     victim = bus.subscribe(got.append)
@@ -104,8 +99,7 @@ def test_a_subscriber_that_another_one_closes_is_no_longer_called() -> None:
     assert got == []
 
 
-def test_a_subscriber_registered_in_a_callback_gets_every_batch_from_the_next_one_on() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_subscriber_registered_in_a_callback_gets_every_batch_from_the_next_one_on(bus: Bus) -> None:
     got: list[Batch] = []
 
     def recruit(batch: Batch) -> None:
@@ -139,8 +133,7 @@ def test_a_batch_published_in_a_callback_is_buffered_at_once_and_delivered_after
     assert bus.statistics().callbacks_failed == 0
 
 
-def test_a_batch_published_during_registration_reaches_every_subscriber_at_once() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_batch_published_during_registration_reaches_every_subscriber_at_once(bus: Bus) -> None:
     got: list[Batch] = []
     bus.subscribe(got.append)
     bus.publish(static("map", "a"))
@@ -154,9 +147,8 @@ def test_a_batch_published_during_registration_reaches_every_subscriber_at_once(
 
 
 def test_endless_publishing_in_a_callback_is_stopped_by_an_error_that_names_it(
-    caplog: pytest.LogCaptureFixture,
+    bus: Bus, caplog: pytest.LogCaptureFixture
 ) -> None:
-    bus = Bus(SimulatedClock())
     errors: list[RuntimeError] = []
 
     def chatterbox(batch: Batch) -> None:
@@ -177,8 +169,7 @@ def test_endless_publishing_in_a_callback_is_stopped_by_an_error_that_names_it(
     assert len(errors) == 2
 
 
-def test_a_subscriber_that_closes_the_bus_does_not_stop_the_delivery_of_the_batch() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_subscriber_that_closes_the_bus_does_not_stop_the_delivery_of_the_batch(bus: Bus) -> None:
     got: list[Batch] = []
     bus.subscribe(lambda _: bus.close())
     bus.subscribe(got.append)
@@ -189,8 +180,7 @@ def test_a_subscriber_that_closes_the_bus_does_not_stop_the_delivery_of_the_batc
 
 
 @pytest.mark.parametrize("together", [True, False])
-def test_a_frame_removed_in_a_callback_is_left_out_for_later_subscribers(together: bool) -> None:
-    bus = Bus(SimulatedClock())
+def test_a_frame_removed_in_a_callback_is_left_out_for_later_subscribers(bus: Bus, together: bool) -> None:
     front: list[Batch] = []
     behind: list[Batch] = []
 
@@ -222,8 +212,7 @@ def test_later_subscribers_get_only_static_samples_if_a_callback_sets_the_clock_
 # Removals
 
 
-def test_removals_are_delivered_in_order_with_the_batches_until_the_subscriber_is_closed() -> None:
-    bus = Bus(SimulatedClock())
+def test_removals_are_delivered_in_order_with_the_batches_until_the_subscriber_is_closed(bus: Bus) -> None:
     log: list[object] = []
     with noting(bus, log):
         bus.publish([moving("map", "a", 1), static("map", "b")])
@@ -251,8 +240,7 @@ def test_the_removal_of_a_frame_that_only_a_buffer_lists_is_delivered() -> None:
 
 
 @pytest.mark.parametrize("first", [True, False], ids=["in front", "behind"])
-def test_a_removal_in_a_callback_is_delivered_between_the_older_and_the_newer_samples(first: bool) -> None:
-    bus = Bus(SimulatedClock())
+def test_a_removal_in_a_callback_is_delivered_between_the_older_and_the_newer_samples(bus: Bus, first: bool) -> None:
     log: list[object] = []
     stamps: list[int] = []
 
@@ -273,8 +261,7 @@ def test_a_removal_in_a_callback_is_delivered_between_the_older_and_the_newer_sa
     assert stamps == [1, 2, 4]
 
 
-def test_a_batch_published_in_a_removal_callback_is_delivered_after_the_removal() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_batch_published_in_a_removal_callback_is_delivered_after_the_removal(bus: Bus) -> None:
     logs: list[list[object]] = [[], []]
     noting(bus, logs[0])
 
@@ -290,8 +277,7 @@ def test_a_batch_published_in_a_removal_callback_is_delivered_after_the_removal(
     assert logs[0] == logs[1] == [["a"], "a", ["a"], ["b"]]
 
 
-def test_a_removal_in_a_removal_callback_is_delivered_to_every_subscriber() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_removal_in_a_removal_callback_is_delivered_to_every_subscriber(bus: Bus) -> None:
     logs: list[list[object]] = [[], []]
     noting(bus, logs[0])
     bus.subscribe(lambda _: None, lambda frame: bus.remove_frame("tool") if frame == "arm" else None)
@@ -303,8 +289,7 @@ def test_a_removal_in_a_removal_callback_is_delivered_to_every_subscriber() -> N
     assert bus.statistics().callbacks_failed == 0
 
 
-def test_a_registration_closed_in_a_removal_callback_ends_both_callbacks() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_registration_closed_in_a_removal_callback_ends_both_callbacks(bus: Bus) -> None:
     log: list[object] = []
     other: list[object] = []
 

@@ -33,6 +33,12 @@ PATIENCE = 30.0
 """Real seconds after which a test that hangs is given up."""
 
 
+@pytest.fixture
+def bus() -> Bus:
+    """On the clock of the machine."""
+    return Bus()
+
+
 def in_thread(function: Callable[[], object]) -> list[Exception]:
     """Run a function in a thread of its own while this one is blocked; give back what it raised."""
     errors: list[Exception] = []
@@ -61,9 +67,7 @@ def threads_running(*functions: Callable[[], object]) -> Iterator[list[threading
         assert not thread.is_alive()
 
 
-async def test_a_thread_wakes_a_lookup_on_a_loop_that_has_nothing_else_to_do() -> None:
-    bus = Bus()
-    buffer = Buffer(bus)
+async def test_a_thread_wakes_a_lookup_on_a_loop_that_has_nothing_else_to_do(bus: Bus, buffer: Buffer) -> None:
     with anyio.fail_after(PATIENCE), bus.threadsafe() as publish:
         async with anyio.create_task_group() as tasks:
             asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
@@ -72,8 +76,7 @@ async def test_a_thread_wakes_a_lookup_on_a_loop_that_has_nothing_else_to_do() -
         assert asked.answer.transform.translation == (5.0, 0.0, 0.0)
 
 
-async def test_the_samples_of_each_thread_arrive_in_order_and_without_loss() -> None:
-    bus = Bus()
+async def test_the_samples_of_each_thread_arrive_in_order_and_without_loss(bus: Bus) -> None:
     seen: dict[str, list[int]] = {"a": [], "b": [], "c": [], "d": []}
     everything = anyio.Event()
 
@@ -95,8 +98,7 @@ async def test_the_samples_of_each_thread_arrive_in_order_and_without_loss() -> 
     assert bus.statistics().samples == 8_000
 
 
-async def test_samples_beyond_the_capacity_while_the_loop_is_blocked_are_dropped_and_counted() -> None:
-    bus = Bus()
+async def test_samples_beyond_the_capacity_while_the_loop_is_blocked_are_dropped_and_counted(bus: Bus) -> None:
     got: list[int] = []
 
     def produce() -> None:
@@ -111,9 +113,7 @@ async def test_samples_beyond_the_capacity_while_the_loop_is_blocked_are_dropped
         assert got == list(range(15, 25))
 
 
-async def test_the_end_of_the_with_publishes_the_queued_samples() -> None:
-    bus = Bus()
-    buffer = Buffer(bus)
+async def test_the_end_of_the_with_publishes_the_queued_samples(bus: Bus, buffer: Buffer) -> None:
     with bus.threadsafe() as publish:
         in_thread(lambda: publish(moving("map", "a", 1)))
         assert not buffer.can_transform("map", "a", 1)
@@ -121,8 +121,7 @@ async def test_the_end_of_the_with_publishes_the_queued_samples() -> None:
     assert bus.statistics().queues == ()
 
 
-async def test_publishing_outside_of_the_with_raises_in_the_thread() -> None:
-    bus = Bus()
+async def test_publishing_outside_of_the_with_raises_in_the_thread(bus: Bus) -> None:
     publish = bus.threadsafe()
     (early,) = in_thread(lambda: publish(moving("map", "a", 1)))
     assert isinstance(early, RuntimeError)
@@ -134,8 +133,7 @@ async def test_publishing_outside_of_the_with_raises_in_the_thread() -> None:
     assert bus.statistics().samples == 0
 
 
-def test_publishing_after_the_end_of_the_loop_raises(run: Run) -> None:
-    bus = Bus()
+def test_publishing_after_the_end_of_the_loop_raises(bus: Bus, run: Run) -> None:
     publishers: list[ThreadPublisher] = []
 
     async def leave_without_a_word() -> None:
@@ -150,9 +148,7 @@ def test_publishing_after_the_end_of_the_loop_raises(run: Run) -> None:
         assert len(publishers[0].queue) == 1, "after the first error it takes no more"
 
 
-async def test_samples_that_close_a_loop_are_dropped_and_counted_on_the_bus() -> None:
-    bus = Bus()
-    buffer = Buffer(bus)
+async def test_samples_that_close_a_loop_are_dropped_and_counted_on_the_bus(bus: Bus, buffer: Buffer) -> None:
     with bus.threadsafe() as publish:
         assert in_thread(lambda: publish(moving("map", "a", 1))) == []
         assert in_thread(lambda: publish([moving("a", "map", 1), moving("map", "b", 1)])) == []
@@ -174,9 +170,7 @@ async def test_samples_queued_before_a_jump_back_are_discarded_and_statics_stay(
         assert [queue.dropped for queue in bus.statistics().queues] == [1]
 
 
-async def test_queued_samples_of_a_removed_frame_are_discarded() -> None:
-    bus = Bus()
-    buffer = Buffer(bus)
+async def test_queued_samples_of_a_removed_frame_are_discarded(bus: Bus, buffer: Buffer) -> None:
     bus.publish(moving("map", "a", 1))
     with bus.threadsafe() as publish:
         in_thread(lambda: publish([moving("map", "a", 2), moving("map", "b", 2)]))
@@ -192,10 +186,8 @@ USES: list[Callable[[Bus, Buffer], object]] = [
 
 @pytest.mark.parametrize("use", USES, ids=["publish", "threadsafe"])
 def test_a_bus_made_before_a_loop_belongs_to_the_thread_of_its_first_loop(
-    run: Run, use: Callable[[Bus, Buffer], object]
+    bus: Bus, buffer: Buffer, run: Run, use: Callable[[Bus, Buffer], object]
 ) -> None:
-    bus = Bus()
-    buffer = Buffer(bus)
 
     async def take_over() -> None:
         use(bus, buffer)
@@ -278,8 +270,7 @@ async def test_a_thread_hears_of_a_wrong_type_or_length_and_a_stamp_ahead_is_cou
     assert (bus.statistics().samples, bus.statistics().rejected) == (1, {"ahead": 1})
 
 
-def test_a_loop_in_the_thread_that_made_the_bus_leaves_it_to_no_other_loop(run: Run) -> None:
-    bus = Bus()
+def test_a_loop_in_the_thread_that_made_the_bus_leaves_it_to_no_other_loop(bus: Bus, run: Run) -> None:
 
     async def use() -> None:
         bus.events().close()
@@ -289,8 +280,7 @@ def test_a_loop_in_the_thread_that_made_the_bus_leaves_it_to_no_other_loop(run: 
     bus.events().close()
 
 
-async def test_a_closed_bus_takes_no_sample_of_a_thread_be_it_queued_or_new() -> None:
-    bus = Bus()
+async def test_a_closed_bus_takes_no_sample_of_a_thread_be_it_queued_or_new(bus: Bus) -> None:
     with bus.threadsafe() as publish:
         in_thread(lambda: publish(moving("map", "a", 1)))
         bus.close()
@@ -302,8 +292,7 @@ async def test_a_closed_bus_takes_no_sample_of_a_thread_be_it_queued_or_new() ->
         bus.threadsafe()
 
 
-def test_publishing_raises_once_the_loop_has_been_closed_without_an_answer_to_the_last_sample() -> None:
-    bus = Bus()
+def test_publishing_raises_once_the_loop_has_been_closed_without_an_answer_to_the_last_sample(bus: Bus) -> None:
     loop = asyncio.new_event_loop()
 
     async def enter() -> ThreadPublisher:

@@ -39,6 +39,11 @@ HOUR = 3600 * SECOND
 NOW = 100 * SECOND
 
 
+@pytest.fixture
+def clock() -> SimulatedClock:
+    return SimulatedClock(NOW)
+
+
 def bus_at(now: int = NOW, **options: Any) -> Bus:
     return Bus(SimulatedClock(now), **options)
 
@@ -55,9 +60,7 @@ def told(kind: type[T], bus: Bus, *samples: TransformStamped) -> list[T]:
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_a_translation_beyond_the_bound_is_refused_at_the_door_of_a_bus(known: bool) -> None:
-    bus = bus_at()
-    buffer = Buffer(bus)
+def test_a_translation_beyond_the_bound_is_refused_at_the_door_of_a_bus(bus: Bus, buffer: Buffer, known: bool) -> None:
     if known:
         bus.publish(moving("a", "b", NOW, 1e12))
     for x in (1.1e12, -1e308):
@@ -121,9 +124,7 @@ def test_a_stamp_is_ahead_only_beyond_the_bound(beyond: int) -> None:
     assert caught.value.ahead == (2 * SECOND + 1) * beyond
 
 
-def test_what_expires_because_of_a_stamp_ahead_says_so() -> None:
-    bus = bus_at()
-    buffer = Buffer(bus)
+def test_what_expires_because_of_a_stamp_ahead_says_so(bus: Bus, buffer: Buffer) -> None:
     bus.publish(moving("map", "base", NOW + HOUR, authority="peer"))
     for k in range(3):
         bus.publish(moving("map", "base", NOW + k, authority="odometry"))
@@ -182,9 +183,7 @@ def test_a_clock_of_the_machine_that_was_set_back_is_noticed_when_samples_expire
     assert bus.statistics().buffers[0].expired_ahead == 1
 
 
-def test_max_age_bounds_the_future_as_well() -> None:
-    bus = bus_at()
-    buffer = Buffer(bus)
+def test_max_age_bounds_the_future_as_well(bus: Bus, buffer: Buffer) -> None:
     bus.publish(moving("map", "base", NOW + 2 * SECOND, authority="peer"))
     assert buffer.lookup_nowait("map", "base", max_age=2.0).stamp == NOW + 2 * SECOND
     with pytest.raises(AheadError) as caught:
@@ -194,9 +193,7 @@ def test_max_age_bounds_the_future_as_well() -> None:
     assert buffer.can_transform("map", "base", max_age=9.2e9)
 
 
-def test_the_edge_that_is_ahead_is_named_the_lagging_one_or_under_a_policy_the_newest() -> None:
-    bus = bus_at()
-    buffer = Buffer(bus)
+def test_the_edge_that_is_ahead_is_named_the_lagging_one_or_under_a_policy_the_newest(bus: Bus, buffer: Buffer) -> None:
     bus.publish([moving("map", "base", NOW + 2 * SECOND), moving("base", "arm", NOW + 5 * SECOND)])
     for policy, child in ((None, "base"), (Hold(10.0), "arm")):
         with pytest.raises(AheadError) as caught:
@@ -280,8 +277,7 @@ async def test_a_clock_that_stands_still_and_a_message_that_comes_late_are_notic
     assert (last.frame, last.at, bus.statistics().behind) == ("late", NOW + 1, 2)
 
 
-def test_a_stream_of_events_that_is_opened_later_hears_of_what_is_still_behind() -> None:
-    bus = bus_at()
+def test_a_stream_of_events_that_is_opened_later_hears_of_what_is_still_behind(bus: Bus) -> None:
     bus.publish([moving("map", "late", 0, authority="driver"), moving("map", "was late", 0)])
     bus.publish([moving("map", "late", 5, authority="driver"), moving("map", "was late", NOW)])
     assert told(StampBehind, bus, moving("map", "late", 9, authority="driver")) == [
@@ -294,8 +290,7 @@ def test_a_stream_of_events_that_is_opened_later_hears_of_what_is_still_behind()
     assert bus.statistics().behind == 5
 
 
-def test_late_data_of_a_robot_and_a_short_history_are_silent(caplog: pytest.LogCaptureFixture) -> None:
-    bus = bus_at()
+def test_late_data_of_a_robot_and_a_short_history_are_silent(bus: Bus, caplog: pytest.LogCaptureFixture) -> None:
     Buffer(bus)
     for late in (0, SECOND // 5, 5 * SECOND):
         bus.publish([moving("map", f"late by {late}", NOW - late + k) for k in range(100)])

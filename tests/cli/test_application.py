@@ -8,13 +8,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.commands import Command, check_wrong_call
+from support.commands import Command
 from support.processes import PATIENCE, TFBUS, Program, new_domain
 from support.recorded import write_mcap
 from support.samples import moving
@@ -114,26 +114,6 @@ def test_completion_is_written_for_a_shell_with_all_commands(
     assert tfbus("--install-completion", "--shell", "bash", "--output", script).returncode == 0
     assert str(script) in (tmp_path / ".bashrc").read_text()
     assert set(COMMANDS) <= set(re.findall(r"\w+", script.read_text()))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        (("no-such-command",), "no-such-command"),
-        (("tree", "--no-such-option"), "--no-such-option"),
-        (("tree", "surplus"), "surplus"),
-        (("info",), "FILE"),
-        (("echo", "map"), "SOURCE"),
-        (("listen", "--backend", "curio"), "--backend"),
-        (("broadcast", "--listen", "rubbish"), "an address is like tcp/192.168.1.5:7447, not 'rubbish'"),
-        (("static", "map", "odom", "--domain", "a b"), "a domain is made of letters"),
-        (("listen", "--log-level", "loud"), "--log-level"),
-    ],
-)
-def test_a_usage_error_is_one_line_on_standard_error_and_status_2(
-    arguments: Sequence[object], why: str, tfbus: Command
-) -> None:
-    check_wrong_call(tfbus(*arguments), why)
 
 
 @pytest.mark.parametrize(

@@ -76,23 +76,13 @@ def test_two_programs_of_a_domain_hear_each_other_and_return_their_results(backe
     assert options.run(meet) == "met"
 
 
-@pytest.mark.parametrize(
-    "address",
-    [
-        *(
-            "",
-            "7447",
-            "127.0.0.1:7447",
-            "foo/127.0.0.1:7447",
-            "tcp",
-            "tcp/",
-            "tcp/:7447",
-            "tcp/127.0.0.1",
-            "tcp/::1:7447",
-        ),
-        *("tcp/127.0.0.1:", "tcp/127.0.0.1:x", "tcp/127.0.0.1:7447 ", "tcp/127.0.0.1:65536", "tcp//127.0.0.1:7447"),
-    ],
+NO_ADDRESSES = (
+    "7447 127.0.0.1:7447 foo/127.0.0.1:7447 tcp tcp/ tcp/:7447 tcp/127.0.0.1 tcp/::1:7447 tcp/127.0.0.1: "
+    "tcp/127.0.0.1:x tcp/127.0.0.1:65536 tcp//127.0.0.1:7447"
 )
+
+
+@pytest.mark.parametrize("address", ["", "tcp/127.0.0.1:7447 ", *NO_ADDRESSES.split()])
 def test_an_address_that_no_program_can_have_is_a_usage_error(address: str) -> None:
     with pytest.raises(UsageError, match=f"an address is like tcp/.+, not {re.escape(repr(address))}"):
         join(LinkOptions(new_domain(), connect=(address,)))

@@ -34,13 +34,6 @@ def test_columns_are_aligned_whatever_the_width_of_the_letters() -> None:
     assert (wide.plain, narrow.plain) == ("├── 雷达  static", "└── odom  static")
 
 
-def test_deeply_nested_frames_are_shown_in_full(capsys: pytest.CaptureFixture[str]) -> None:
-    chain = [Edge(f"frame{level}", f"frame{level + 1}", True, 1, None, None, "robot") for level in range(50)]
-    with TreeDisplay(live=False) as display:
-        display.show(chain, 0)
-    assert capsys.readouterr().out == describe(chain, 0) + "\n"
-
-
 def test_where_the_output_is_no_terminal_a_live_tree_is_printed_again_below_a_blank_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -88,10 +81,6 @@ def test_the_branches_can_be_drawn_in_ascii() -> None:
         "    |-- arm    one sample  age 2 s  span 0 ns  from 'driver'",
         "    `-- lidar  static",
     ]
-
-
-def test_an_empty_tree_is_one_line() -> None:
-    assert [line.plain for line in tree_lines([], 0)] == ["(no frames)"]
 
 
 ARM = [

@@ -29,12 +29,6 @@ from tfbus.stamps import STAMP_MAX
 POINTS = np.zeros((2, 3))
 
 
-def test_every_point_is_transformed() -> None:
-    # The numbers of tf2_sensor_msgs' test_tf2_sensor_msgs.cpp.
-    moved = do_transform(PointCloud("B", 0, np.array([(1.0, 2.0, 3.0), (0.0, 0.0, 0.0)])), ANSWER)
-    np.testing.assert_allclose(moved.points, [(-9.0, 18.0, 27.0), (-10.0, 20.0, 30.0)], rtol=0.0, atol=1e-13)
-
-
 @given(transforms(), st.lists(vectors(), min_size=1, max_size=5))
 def test_a_cloud_is_transformed_point_by_point(t: Transform, points: list[Vector]) -> None:
     sample = TransformStamped("A", "B", 0, t)

@@ -49,50 +49,19 @@ from tfbus.stamps import LATEST, Latest
 from tfbus.testing import simulate
 from tfbus.tf_message import MalformedMessageError
 
+# Of each kind of letter that is not printable, some: controls of both kinds, separators, marks of the direction of a
+# text, blanks that take no place or look like others, tags, private letters, and numbers that are no letter.
+HIDDEN = (
+    "\a\b\0\t\v\f\x1c\x1d\x1e\x7f\x85\x9b\x9d\xa0\xad\u061c\u180e\u2003\u200b\u200d\u200e\u200f\u2028\u2029\u202d\u202e"
+)
+HIDDEN += "\u2066\u3000\ue000\ufdd0\ufeff\uffff\U000e0041\U0010fffd"
+BREAK, CLEAR, FORMULA = "x\n2026-11-25 00:00:00 CRITICAL emergency stop released", "\x1b[2J\x1b[H", "$\\frac{1}{$"
 NAMES = [
-    "x\n2026-11-25 00:00:00 CRITICAL emergency stop released",
-    "x\r2026-11-25 00:00:00 CRITICAL emergency stop released",
-    "x\r\ntfbus: nothing is wrong",
-    "x\n\n\n└── base_link  static",
-    "\x1b[2J\x1b[H",
-    "\x1b]0;title\x07",
-    "\x1b]8;;http://evil.example\x1b\\link\x1b]8;;\x1b\\",
-    "\x1b[8mhidden\x1b[0m",
-    "bell\x07",
-    "back\x08\x08\x08\x08",
-    "nul\x00",
-    "tab\tfeed\x0bform\x0c",
-    "file\x1cgroup\x1drecord\x1e",
-    "del\x7f",
-    "csi\x9b2J",
-    "nel\x85next",
-    "osc\x9d0;title\x9c",
-    "line\u2028separator",
-    "paragraph\u2029separator",
-    "\u202ecod.exe",
-    "\u2066isolate\u2069",
-    "\u202dforced\u202c",
-    "zero\u200bwidth",
-    "join\u200der",
-    "mark\u200emark\u200f\u061c",
-    "\ufeffbom",
-    "soft\u00adhyphen",
-    "\u180evowel",
-    "tag\U000e0041\U000e007f",
-    "private\ue000\U0010fffd",
-    "none\uffff\ufdd0",
-    "blank\u00a0\u2003\u3000",
-    "[bold red]x[/bold red]",
-    "[link=http://evil.example]x[/]",
-    "$\\frac{1}{$",
-    "$x^2$",
-    "_hidden",
-    "<script>alert(1)</script>",
-    "&#8238;&#10;<br>",
-    "{0.__class__} %s %d %(name)s",
-    '"quoted\\" \\n',
-    "größe 基座 🦾",
-    "l" * 1_000,
+    *(BREAK, CLEAR, FORMULA, BREAK.replace("\n", "\r"), "x\r\ntfbus: nothing is wrong", "x\n\n\n└── base_link  static"),
+    *("\x1b]0;title\x07", "\x1b]8;;http://evil.example\x1b\\link\x1b]8;;\x1b\\", "\x9b2J", "\x9d0;title\x9c"),
+    *(f"x{letter}moc.live" for letter in HIDDEN),
+    *("[bold red]x[/bold red]", "[link=http://evil.example]x[/]", "$x^2$", "_hidden", "<script>alert(1)</script>"),
+    *("&#8238;&#10;<br>", "{0.__class__} %s %d %(name)s", '"quoted\\" \\n', "größe 基座 🦾", "l" * 1_000),
 ]
 PLAIN = [f"frame{number}" for number in range(len(NAMES))]
 HALF = "half\ud800"
@@ -318,7 +287,7 @@ def tfbus(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    return recorded(tmp_path / f"{NAMES[0]} {NAMES[4]}.mcap", NAMES)
+    return recorded(tmp_path / f"{BREAK} {CLEAR}.mcap", NAMES)
 
 
 @pytest.fixture
@@ -329,7 +298,7 @@ def plain_recording(tmp_path: Path) -> Path:
 def recorded(path: Path, names: Sequence[str]) -> Path:
     """A recording with each name as a frame, an authority and a topic; two loops of parents are left out of it."""
     batches = [[moving("map", name, stamp * SECOND, stamp) for name in names] for stamp in range(4)]
-    loops = [moving(names[0], "map", SECOND), moving(names[4], "map", SECOND)]
+    loops = [moving(names[0], "map", SECOND), moving(names[1], "map", SECOND)]
     lines: list[Any] = [
         *((number, "/tf", batch) for number, batch in enumerate(batches)),
         (4, "/tf", loops),
@@ -405,7 +374,7 @@ def test_every_command_is_walked_or_prints_no_names() -> None:
 
 def filled(arguments: Sequence[object], file: Path, names: Sequence[str]) -> list[object]:
     """Arguments with a file for 0, a name for another number, and a new file for NEW."""
-    places: dict[object, object] = {0: file, 1: names[0], 2: names[4], "NEW": file.with_name(f"{file.stem} new.mcap")}
+    places: dict[object, object] = {0: file, 1: names[0], 2: names[1], "NEW": file.with_name(f"{file.stem} new.mcap")}
     return [places.get(argument, argument) for argument in arguments]
 
 
@@ -487,7 +456,7 @@ def test_figures_show_every_name_in_one_line_and_in_no_formula(kind: str, record
         shown = [text.get_text() for text in figure.axes[0].get_yticklabels()]
     else:
         draw = plot.plot_path if kind == "path" else plot.plot_transforms
-        figure = draw(tree, NAMES[34], *NAMES)
+        figure = draw(tree, FORMULA, *NAMES)
         legend = figure.legends[0] if figure.legends else figure.axes[0].get_legend()
         assert legend is not None
         shown = [text.get_text() for text in legend.get_texts()]

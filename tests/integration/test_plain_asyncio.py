@@ -22,8 +22,7 @@ def make() -> tuple[Bus, Buffer]:
     return bus, Buffer(bus)
 
 
-def test_asyncio_timeout_ends_a_wait() -> None:
-    _, buffer = make()
+def test_asyncio_timeout_ends_a_wait(buffer: Buffer) -> None:
 
     async def main() -> None:
         with pytest.raises(TimeoutError) as caught:
@@ -39,8 +38,7 @@ def test_asyncio_timeout_ends_a_wait() -> None:
     asyncio.run(main())
 
 
-def test_wait_for_ends_a_wait_and_passes_an_answer_on() -> None:
-    bus, buffer = make()
+def test_wait_for_ends_a_wait_and_passes_an_answer_on(bus: Bus, buffer: Buffer) -> None:
 
     async def main() -> None:
         with pytest.raises(TimeoutError):
@@ -52,8 +50,7 @@ def test_wait_for_ends_a_wait_and_passes_an_answer_on() -> None:
     asyncio.run(main())
 
 
-def test_a_task_group_that_fails_takes_its_waits_with_it() -> None:
-    _, buffer = make()
+def test_a_task_group_that_fails_takes_its_waits_with_it(buffer: Buffer) -> None:
 
     async def fail() -> None:
         await settle()
@@ -72,8 +69,7 @@ def test_a_task_group_that_fails_takes_its_waits_with_it() -> None:
     asyncio.run(main())
 
 
-def test_a_cancelled_task_is_cancelled_and_leaves_nothing_behind() -> None:
-    bus, buffer = make()
+def test_a_cancelled_task_is_cancelled_and_leaves_nothing_behind(bus: Bus, buffer: Buffer) -> None:
 
     async def main() -> None:
         tasks = [asyncio.create_task(buffer.lookup("map", "a")) for _ in range(3)]
@@ -114,8 +110,7 @@ def test_a_task_that_is_cancelled_in_the_turn_of_its_answer_or_its_timeout_is_ca
     asyncio.run(main())
 
 
-def test_a_stream_is_read_by_a_task() -> None:
-    bus, _ = make()
+def test_a_stream_is_read_by_a_task(bus: Bus) -> None:
 
     async def main() -> None:
         with bus.stream(overflow="drop_oldest") as stream:

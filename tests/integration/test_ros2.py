@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, asynccontextmanager, contextmanager
+from functools import partial
 from pathlib import Path
 
 import anyio
@@ -24,11 +25,12 @@ from support.both_sides import (
     check_clock,
     check_command,
     check_description_and_joints,
+    check_killed_node,
+    check_link_that_came_back,
     meet,
     node,
 )
-from support.processes import free_ports, until
-from support.samples import latched
+from support.processes import free_ports
 
 from tfbus import Buffer, Bus
 from tfbus.links.ros import RosLink
@@ -42,11 +44,12 @@ CYCLONE_PEER = PEER.with_name("cyclone_peer.py")
 _next_domain = iter(range(100 + os.getpid() % 50, 200))
 
 
-def ros2_python() -> str:
-    """A Python that has ROS 2; skips the test if there is none."""
+def ros2_python(further: str = "") -> str:
+    """A Python that has what the tests' nodes of ROS 2 import; skips the test if there is none."""
     python = os.environ.get("ROS2_PYTHON") or shutil.which("python3")
-    if python is None or subprocess.run([python, "-c", "import rclpy, tf2_ros"], capture_output=True).returncode:
-        pytest.skip("no ROS 2: set ROS2_PYTHON to a Python with rclpy and tf2_ros")
+    needed = "import rclpy, tf2_ros, geometry_msgs.msg, rosgraph_msgs.msg, sensor_msgs.msg, std_msgs.msg, tf2_msgs.msg"
+    if python is None or subprocess.run([python, "-c", needed + further], capture_output=True).returncode:
+        pytest.skip("no ROS 2: set ROS2_PYTHON to a Python with rclpy, tf2_ros, and the messages of common_interfaces")
     return python
 
 
@@ -175,33 +178,15 @@ async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed(kind
 async def test_a_node_that_is_killed_is_heard_again_when_it_is_back(kind: str) -> None:
     domain = next(_next_domain)
     async with links(kind, domain) as (link_of, peer_of, _):
-        with Bus() as bus, Buffer(bus) as buffer:
-            async with link_of(bus) as link:
-                with peer_of(domain, 60.0):
-                    found = await buffer.lookup("base", "laser", timeout=20.0)
-                    assert found.transform.translation[0] == 0.5
-                # Killed without a word: a new one says something else.
-                with peer_of(domain, 60.0, x=0.75):
-                    await until(lambda: latched(bus)["laser"].transform.translation[0] == 0.75)
-                assert link.statistics().rejected == {}
+        with Bus() as bus:
+            await check_killed_node(link_of(bus), bus, partial(peer_of, domain))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(kind: str) -> None:
     domain = next(_next_domain)
     async with links(kind, domain) as (link_of, peer_of, _):
-        with peer_of(domain, 8.0) as ros, Bus() as bus, Buffer(bus) as buffer:
-            assert (await ros.next_line())["event"] == "up"
-            program = Program(bus, buffer)
-            for _ in range(2):
-                async with link_of(bus), anyio.create_task_group() as tasks:
-                    tasks.start_soon(program.send)
-                    await buffer.lookup("odom", "tool", timeout=20.0)
-                    await anyio.sleep(1.0)
-                    tasks.cancel_scope.cancel()
-            facts = await ros.next_line()
-    assert facts["answered"] > 50
-    assert facts["wrong"] == 0
+        await check_link_that_came_back(link_of, peer_of(domain, 8.0))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -221,5 +206,5 @@ async def test_a_late_link_has_the_static_frames_of_ros_and_of_other_links(kind:
 def test_messages_of_rclpy_become_data_and_messages_again() -> None:
     # The Python of ROS comes first, for its numpy.
     script = f"import sys, runpy; sys.path += {sys.path!r}; runpy.run_path({str(MESSAGES)!r}, run_name='__main__')"
-    done = subprocess.run([ros2_python(), "-c", script], capture_output=True, text=True, check=False)
+    done = subprocess.run([ros2_python(", numpy"), "-c", script], capture_output=True, text=True, check=False)
     assert (done.stdout, done.stderr) == ("equal 11\n", "")

@@ -14,6 +14,16 @@ from tfbus.links.message import Heard, Kind, read_message, write_text
 from tfbus.links.relay import ReceivedBatch
 
 
+@pytest.fixture
+def world() -> World:
+    return World()
+
+
+@pytest.fixture
+def network(world: World) -> Network:
+    return Network(world)
+
+
 def counts(process: Process) -> dict[str, int]:
     """The number of samples of each frame that a bus has heard."""
     found: dict[str, int] = {}
@@ -99,9 +109,7 @@ def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_th
     assert counts(long) == {"f0": 3}
 
 
-def test_a_link_for_no_frame_at_all_hears_and_sends_nothing() -> None:
-    world = World()
-    network = Network(world)
+def test_a_link_for_no_frame_at_all_hears_and_sends_nothing(world: World, network: Network) -> None:
     one, none = world.process(network), world.process(network, frames=[])
     one.say(static("map", "a"), moving("map", "b", 1))
     none.say(static("map", "c"))
@@ -112,9 +120,7 @@ def test_a_link_for_no_frame_at_all_hears_and_sends_nothing() -> None:
 # Robots
 
 
-def test_only_the_robots_that_are_asked_for_are_peers_and_heard() -> None:
-    world = World()
-    network = Network(world)
+def test_only_the_robots_that_are_asked_for_are_peers_and_heard(world: World, network: Network) -> None:
     robots = {name: world.process(network, robot=name) for name in ("r1", "r17", "s1")}
     unnamed = world.process(network)
     some = world.process(network, robots={"r1": float("inf")})
@@ -155,9 +161,7 @@ def test_of_a_slow_robot_come_static_frames_at_once_and_the_newest_of_moving_one
     assert slow.end.lost == 0
 
 
-def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer() -> None:
-    world = World()
-    network = Network(world)
+def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer(world: World, network: Network) -> None:
     robot = world.process(network, robot="r1")
     quiet = world.process(network, robots={"r1": 0.0}, history=5.0)
     robot.say(static("map", "a"))
@@ -169,9 +173,7 @@ def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer() -> None:
     assert not quiet.end.rejected
 
 
-def test_what_a_link_publishes_goes_to_each_hearer_in_its_own_way() -> None:
-    world = World()
-    network = Network(world)
+def test_what_a_link_publishes_goes_to_each_hearer_in_its_own_way(world: World, network: Network) -> None:
     robot = world.process(network, robot="r1")
     hearers = [
         world.process(network),

@@ -68,6 +68,11 @@ class Scene:
         return self.process.end.samples, self.process.end.duplicates
 
 
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
 # The entry of a frame that counts
 
 SAID = {"s": static, "m": lambda parent, child, x: moving(parent, child, int(x), x)}
@@ -94,8 +99,7 @@ Step = tuple[str, int, bytes]
     ],
 )
 @pytest.mark.parametrize("at_once", [False, True])
-def test_the_word_of_the_highest_number_holds(steps: Sequence[Step], stays: bool, at_once: bool) -> None:
-    scene = Scene()
+def test_the_word_of_the_highest_number_holds(scene: Scene, steps: Sequence[Step], stays: bool, at_once: bool) -> None:
     entries: list[OutgoingBatch | RemovedFrame] = []
     for what, number, origin in steps:
         if what == "r":
@@ -107,8 +111,7 @@ def test_the_word_of_the_highest_number_holds(steps: Sequence[Step], stays: bool
     assert scene.frames == ({"a"} if stays else set())
 
 
-def test_a_moving_sample_does_not_replace_a_static_one_that_was_said_later() -> None:
-    scene = Scene()
+def test_a_moving_sample_does_not_replace_a_static_one_that_was_said_later(scene: Scene) -> None:
     scene.say(static("map", "a", 1.0), number=5)
     scene.say(moving("map", "a", 8), number=4, origin=OTHER)
     assert scene.process.seen == [static("map", "a", 1.0)]
@@ -116,8 +119,7 @@ def test_a_moving_sample_does_not_replace_a_static_one_that_was_said_later() -> 
     assert scene.process.seen[1:] == [moving("map", "a", 9)]
 
 
-def test_what_comes_again_or_late_is_counted_and_what_this_bus_has_said_is_no_news() -> None:
-    scene = Scene()
+def test_what_comes_again_or_late_is_counted_and_what_this_bus_has_said_is_no_news(scene: Scene) -> None:
     for number in (2, 2, 1, 3):
         scene.say(moving("map", "a", number), number=number)
     assert scene.counts == (2, 2)
@@ -129,8 +131,7 @@ def test_what_comes_again_or_late_is_counted_and_what_this_bus_has_said_is_no_ne
     assert scene.told() == [], "nothing was said again"
 
 
-def test_a_message_of_nothing_calls_no_subscriber() -> None:
-    scene = Scene()
+def test_a_message_of_nothing_calls_no_subscriber(scene: Scene) -> None:
     scene.stranger.say()
     assert scene.process.batches == []
     assert scene.process.end.messages == 1
@@ -149,8 +150,7 @@ def test_the_batches_of_a_message_are_published_one_by_one_and_those_of_an_answe
 # Numbers
 
 
-def test_a_number_that_no_bus_can_have_given_is_refused_and_later_ones_are_news() -> None:
-    scene = Scene()
+def test_a_number_that_no_bus_can_have_given_is_refused_and_later_ones_are_news(scene: Scene) -> None:
     scene.say(moving("map", "a", 1), number=7)
     for number in (2**64 - 1 - scene.first, LARGEST_JUMP + 10**9):
         scene.say(moving("map", "a", 2), moving("map", "b", 2), number=number)
@@ -162,8 +162,7 @@ def test_a_number_that_no_bus_can_have_given_is_refused_and_later_ones_are_news(
     assert scene.counts == (3, 0)
 
 
-def test_a_number_of_this_bus_that_somebody_has_made_up_does_not_hide_what_it_says_later() -> None:
-    scene = Scene()
+def test_a_number_of_this_bus_that_somebody_has_made_up_does_not_hide_what_it_says_later(scene: Scene) -> None:
     scene.process.say(static("map", "s", 1.0), static("map", "t"), moving("map", "m", 1))
     scene.world.run(0.01)
     scene.told()
@@ -204,8 +203,7 @@ def test_gaps_in_the_numbers_of_a_peer_are_messages_that_were_lost() -> None:
     assert scene.process.end.lost == 3, "one that comes back begins anew"
 
 
-def test_whoever_misses_a_message_asks_soon() -> None:
-    scene = Scene()
+def test_whoever_misses_a_message_asks_soon(scene: Scene) -> None:
     scene.stranger.say(kind=Kind.ANSWER)
     scene.stranger.say(number=1)
     scene.world.run(10.0)
@@ -219,9 +217,8 @@ def test_whoever_misses_a_message_asks_soon() -> None:
 
 
 def test_what_no_message_can_say_is_counted_and_told_once_for_each_peer_and_reason(
-    caplog: pytest.LogCaptureFixture,
+    scene: Scene, caplog: pytest.LogCaptureFixture
 ) -> None:
-    scene = Scene()
     with scene.process.bus.events(stale_after=None) as events:
         for bad in (
             b"",
@@ -289,8 +286,7 @@ def test_too_many_frames_of_a_bus_are_refused_and_counted_and_those_that_went_ma
     assert len(scene.frames) > 3 * (MANY_ORIGINS - 2)
 
 
-def test_batches_with_too_many_authorities_of_a_peer_are_refused_and_counted() -> None:
-    scene = Scene()
+def test_batches_with_too_many_authorities_of_a_peer_are_refused_and_counted(scene: Scene) -> None:
     for number in range(MAX_AUTHORITIES + 2):
         scene.say(static("map", "a", authority=f"node {number}"), number=number + 1)
     assert scene.rejected == {"too many authorities": 2}
@@ -306,8 +302,7 @@ def test_batches_with_too_many_authorities_of_a_peer_are_refused_and_counted() -
     assert (lost.link, lost.peer, lost.frames, len(lost.authorities)) == ("tf", scene.stranger.id, ("a",), 1_000)
 
 
-def test_nothing_is_taken_of_a_link_that_was_not_announced_or_has_gone() -> None:
-    scene = Scene()
+def test_nothing_is_taken_of_a_link_that_was_not_announced_or_has_gone(scene: Scene) -> None:
     scene.process.wire.part(scene.stranger)
     scene.world.run(0.01)
     scene.say(static("map", "a"), number=1)
@@ -317,8 +312,7 @@ def test_nothing_is_taken_of_a_link_that_was_not_announced_or_has_gone() -> None
 # Subscribers
 
 
-def test_a_subscriber_that_raises_hears_all_the_same_and_one_that_closes_the_bus_ends_a_message() -> None:
-    scene = Scene()
+def test_a_subscriber_that_raises_hears_all_the_same_and_one_that_closes_the_bus_ends_a_message(scene: Scene) -> None:
 
     def fail(batch: Sequence[TransformStamped]) -> None:
         raise ValueError(batch[0].child)
@@ -363,8 +357,7 @@ def test_a_subscriber_may_change_the_frames_of_a_lost_peer_when_it_hears_of_it()
 # Questions
 
 
-def test_a_question_is_answered_with_what_this_link_brings_and_a_bad_one_is_refused() -> None:
-    scene = Scene()
+def test_a_question_is_answered_with_what_this_link_brings_and_a_bad_one_is_refused(scene: Scene) -> None:
     scene.process.say(moving("map", "m", 1))
     for fields in ({"since": 0}, {"since": 0, "frames": ["m", "x"]}, {"since": 10**9, "frames": []}):
         scene.stranger.say_bytes(write_text(Kind.QUESTION, fields))

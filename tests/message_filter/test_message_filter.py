@@ -60,21 +60,6 @@ class Streams(NamedTuple):
 
 
 @pytest.fixture
-def clock() -> SimulatedClock:
-    return SimulatedClock()
-
-
-@pytest.fixture
-def bus(clock: SimulatedClock) -> Bus:
-    return Bus(clock)
-
-
-@pytest.fixture
-def buffer(bus: Bus) -> Buffer:
-    return Buffer(bus)
-
-
-@pytest.fixture
 def streams() -> Iterator[Streams]:
     send, receive = anyio.create_memory_object_stream[Scan](1_000)
     with send, receive:
@@ -645,9 +630,7 @@ def test_an_asyncio_timeout_around_a_filter_raises_a_timeout_error(around: str) 
 
 
 @pytest.mark.parametrize("where", ["waiting", "in the body", "with an answer"])
-def test_a_cancelled_asyncio_task_with_a_filter_is_cancelled(where: str) -> None:
-    bus = Bus(SimulatedClock())
-    buffer = Buffer(bus)
+def test_a_cancelled_asyncio_task_with_a_filter_is_cancelled(bus: Bus, buffer: Buffer, where: str) -> None:
 
     async def reading() -> None:
         async with MessageFilter(Source(StopAsyncIteration(), Scan(5)), buffer, "map") as pairs:

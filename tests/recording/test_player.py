@@ -137,14 +137,6 @@ async def test_samples_are_published_as_they_were_recorded(tmp_path: Path) -> No
     assert (player.played, player.messages, player.passes, player.bad) == (4, 3, 1, {})
 
 
-async def test_a_simulated_clock_goes_from_message_to_message(tmp_path: Path) -> None:
-    times = (0.0, 0.1, 0.1, 0.25, 3_600.000_000_001, 3_600.5)
-    path, clock = write_recording(tmp_path / "run.mcap", *drive(times)), SimulatedClock()
-    _, heard = await played(path, clock)
-    assert heard.entries == drive(times)
-    assert clock.now() == START + 3_600 * SECOND + SECOND // 2
-
-
 async def test_messages_out_of_order_do_not_turn_the_clock_back(bus: Bus, tmp_path: Path) -> None:
     lines = [(received, "/tf", [moving("map", "base", received)]) for received in (5, 3, 9)]
     path = write_mcap(tmp_path / "run.mcap", lines, finish=False)

@@ -78,26 +78,24 @@ def test_a_message_is_one_batch_with_its_own_stamp_and_by_default_with_the_clock
 
 
 @pytest.mark.every_loop
-async def test_a_lookup_that_waits_for_a_stamp_is_woken_by_the_message_of_that_stamp() -> None:
-    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
-        robot = RobotStatePublisher(bus, CRANE)
-        async with anyio.create_task_group() as tasks:
-            asked = Asked(tasks, lambda: buffer.lookup("base", "hook", from_seconds(2.0)))
-            for second in (1.0, 2.0):
-                await settle()
-                assert not asked.ended
-                robot.publish({"swing": 0.0, "rope": second}, from_seconds(second))
-        assert asked.answer.transform.translation == (2.0, 0.0, 3.0)
+async def test_a_lookup_that_waits_for_a_stamp_is_woken_by_the_message_of_that_stamp(bus: Bus, buffer: Buffer) -> None:
+    robot = RobotStatePublisher(bus, CRANE)
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, lambda: buffer.lookup("base", "hook", from_seconds(2.0)))
+        for second in (1.0, 2.0):
+            await settle()
+            assert not asked.ended
+            robot.publish({"swing": 0.0, "rope": second}, from_seconds(second))
+    assert asked.answer.transform.translation == (2.0, 0.0, 3.0)
 
 
-def test_several_robots_share_a_bus_under_prefixes() -> None:
-    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
-        for prefix, length in (("left/", 1.0), ("right/", 2.0)):
-            RobotStatePublisher(bus, CRANE, prefix=prefix).publish({"swing": 0.0, "rope": length})
-        for prefix, length in (("left/", 1.0), ("right/", 2.0)):
-            hook = buffer.lookup_nowait(f"{prefix}base", f"{prefix}hook").transform.translation
-            assert hook == (2.0, 0.0, 5.0 - length)
-        assert "base" not in buffer.tree.frames()
+def test_several_robots_share_a_bus_under_prefixes(bus: Bus, buffer: Buffer) -> None:
+    for prefix, length in (("left/", 1.0), ("right/", 2.0)):
+        RobotStatePublisher(bus, CRANE, prefix=prefix).publish({"swing": 0.0, "rope": length})
+    for prefix, length in (("left/", 1.0), ("right/", 2.0)):
+        hook = buffer.lookup_nowait(f"{prefix}base", f"{prefix}hook").transform.translation
+        assert hook == (2.0, 0.0, 5.0 - length)
+    assert "base" not in buffer.tree.frames()
 
 
 def test_unknown_joints_are_counted_and_logged_once_each(caplog: pytest.LogCaptureFixture) -> None:
@@ -110,24 +108,22 @@ def test_unknown_joints_are_counted_and_logged_once_each(caplog: pytest.LogCaptu
 
 
 def test_violations_are_counted_and_logged_once_a_joint_and_nothing_is_clamped(
-    caplog: pytest.LogCaptureFixture,
+    bus: Bus, buffer: Buffer, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
-        robot = RobotStatePublisher(bus, CRANE)
-        with caplog.at_level(logging.WARNING, "tfbus"):
-            for rope in (4.0, 5.0, 6.0):
-                robot.publish({"swing": 0.5, "rope": rope})
-        assert robot.statistics() == RobotStatistics(messages=3, unknown_joints=0, violations={"rope": 2})
-        assert caplog.messages == ["robot 'crane', joint 'rope': position 5 is outside its limits, from 0 to 4"]
-        assert buffer.lookup_nowait("boom", "hook").transform.translation == (2.0, 0.0, -6.0)
+    robot = RobotStatePublisher(bus, CRANE)
+    with caplog.at_level(logging.WARNING, "tfbus"):
+        for rope in (4.0, 5.0, 6.0):
+            robot.publish({"swing": 0.5, "rope": rope})
+    assert robot.statistics() == RobotStatistics(messages=3, unknown_joints=0, violations={"rope": 2})
+    assert caplog.messages == ["robot 'crane', joint 'rope': position 5 is outside its limits, from 0 to 4"]
+    assert buffer.lookup_nowait("boom", "hook").transform.translation == (2.0, 0.0, -6.0)
 
 
 @pytest.mark.parametrize(
     "positions",
     [[0.5, 1.5], (0.5, 1.5), np.array([0.5, 1.5]), np.array([0.5, 1.5], np.float32), [np.float64(0.5), 1.5]],
 )
-def test_names_and_positions_may_be_parallel_sequences_as_in_ros(positions: Any) -> None:
-    bus = Bus(SimulatedClock())
+def test_names_and_positions_may_be_parallel_sequences_as_in_ros(bus: Bus, positions: Any) -> None:
     robot = RobotStatePublisher(bus, CRANE)
     got = batches_of(bus)
     robot.publish_state(["swing", "rope"], positions, 7)
@@ -145,8 +141,7 @@ def test_names_and_positions_may_be_parallel_sequences_as_in_ros(positions: Any)
         (["rope", "swing", "rope"], [1.0, 2.0, 3.0], "a joint has one position, but there are several of 'rope'"),
     ],
 )
-def test_inconsistent_names_and_positions_are_refused(names: Any, positions: Any, message: str) -> None:
-    bus = Bus(SimulatedClock())
+def test_inconsistent_names_and_positions_are_refused(bus: Bus, names: Any, positions: Any, message: str) -> None:
     robot = RobotStatePublisher(bus, CRANE)
     got = batches_of(bus)
     got.clear()
@@ -155,8 +150,7 @@ def test_inconsistent_names_and_positions_are_refused(names: Any, positions: Any
     assert got == []
 
 
-def test_nothing_is_published_or_counted_if_one_position_is_bad() -> None:
-    bus = Bus(SimulatedClock())
+def test_nothing_is_published_or_counted_if_one_position_is_bad(bus: Bus) -> None:
     robot = RobotStatePublisher(bus, CRANE)
     got = batches_of(bus)
     got.clear()
@@ -180,15 +174,13 @@ def test_a_refusal_of_the_bus_is_raised() -> None:
 
 
 @pytest.mark.parametrize("prefix", ["/", "/robot1/"])
-def test_a_prefix_with_a_leading_slash_is_refused_before_anything_is_sent(prefix: str) -> None:
-    bus = Bus(SimulatedClock())
+def test_a_prefix_with_a_leading_slash_is_refused_before_anything_is_sent(bus: Bus, prefix: str) -> None:
     with pytest.raises(ValueError, match="must not be empty or start with '/'"):
         RobotStatePublisher(bus, CRANE, prefix)
     assert bus.statistics().samples == 0
 
 
-def test_a_publisher_that_drops_goes_on_whatever_edges_others_publish() -> None:
-    bus = Bus(SimulatedClock())
+def test_a_publisher_that_drops_goes_on_whatever_edges_others_publish(bus: Bus) -> None:
     model = RobotModel(
         "r", ("base", "a", "b"), (Joint("fix", "fixed", "base", "a"), Joint("turn", "revolute", "a", "b"))
     )

@@ -13,6 +13,7 @@ from typing import Any
 import anyio
 import anyio.to_thread
 from support.processes import start_tfbus, until
+from support.samples import latched
 
 from tfbus import SECOND, Buffer, Bus, SimulatedClock, Transform, TransformBroadcaster, TransformStamped
 from tfbus.geometry.stamped import Batch
@@ -128,6 +129,36 @@ async def meet(link: RosLink, bus: Bus, *nodes: AbstractContextManager[Node]) ->
         assert facts["failed"] <= MOST_FAILED * (facts["answered"] + facts["failed"])
     assert link.statistics().rejected == {}
     return program.authorities
+
+
+async def check_killed_node(link: RosLink, bus: Bus, make_node: Callable[..., AbstractContextManager[Node]]) -> None:
+    """A node that is killed is heard again when it is back."""
+    with Buffer(bus) as buffer:
+        async with link:
+            with make_node(60.0):
+                found = await buffer.lookup("base", "laser", timeout=20.0)
+                assert found.transform.translation[0] == 0.5
+            # Killed without a word: a new one says something else.
+            with make_node(60.0, x=0.75):
+                await until(lambda: latched(bus)["laser"].transform.translation[0] == 0.75)
+            assert link.statistics().rejected == {}
+
+
+async def check_link_that_came_back(make_link: Callable[[Bus], RosLink], peer: AbstractContextManager[Node]) -> None:
+    """A node hears the static frames of a link that came back."""
+    with peer as other, Bus() as bus, Buffer(bus) as buffer:
+        assert (await other.next_line())["event"] == "up"
+        program = Program(bus, buffer)
+        for _ in range(2):
+            async with make_link(bus), anyio.create_task_group() as tasks:
+                tasks.start_soon(program.send)
+                # A stamp that nobody has sent yet.
+                await buffer.lookup("odom", "tool", time.time_ns() + SECOND // 10, timeout=20.0)
+                await anyio.sleep(1.0)
+                tasks.cancel_scope.cancel()
+        facts = await other.next_line()
+    assert facts["answered"] > 50
+    assert facts["wrong"] == 0
 
 
 # A robot that a real ROS describes and moves, and checks of what is heard of it; `ros1_robot.py`, `ros2_robot.py`

@@ -46,65 +46,40 @@ def parents_of(edges: Mapping[str, KnownEdge]) -> set[str]:
     return {edge.parent for edge in edges.values()}
 
 
-BEFORE = edges_of(moving("map", "base", 10), moving("base", "tool", 10))
+def samples_of(text: str) -> list[TransformStamped]:
+    """Samples, each as PARENT>CHILD@STAMP, or as PARENT>CHILD if it is static."""
+    edges = [(*edge.split(">"), at) for edge, _, at in (word.partition("@") for word in text.split())]
+    return [moving(parent, child, int(at)) if at else static(parent, child) for parent, child, at in edges]
+
+
+CHAIN = "map>base@10 base>tool@10"
 
 
 @pytest.mark.parametrize(
-    ("edges", "batch", "refused"),
+    ("before", "batch", "refused"),
     [
-        pytest.param(BEFORE, [moving("tool", "base", 10)], [0], id="a sample at the newest stamp"),
-        pytest.param(BEFORE, [static("tool", "base", stamp=0)], [0], id="a static sample of any stamp"),
-        pytest.param(BEFORE, [moving("tool", "map", -5)], [0], id="the first sample of a child"),
-        pytest.param(
-            edges_of(static("map", "base", stamp=10), moving("base", "tool", 10)),
-            [moving("tool", "base", 1)],
-            [0],
-            id="a moving sample of any stamp after a static one",
-        ),
-        pytest.param(edges_of(static("a", "b"), static("b", "c")), [static("c", "a")], [0], id="static edges"),
-        pytest.param(BEFORE, [moving("base", "map", 11)], [0], id="an edge turned round"),
-        pytest.param(
-            {}, [moving("a", "b", 0), moving("b", "c", 0), moving("c", "a", 0)], [2], id="a loop inside the batch"
-        ),
-        pytest.param(
-            BEFORE,
-            [moving("tool", "map", 11), moving("tool", "map", 12), moving("x", "y", 0)],
-            [1, 0],
-            id="a loop that is closed twice",
-        ),
-        pytest.param(
-            BEFORE, [moving("world", "map", 11), moving("tool", "map", 12)], [1], id="only the newer of two parents"
-        ),
-        pytest.param(
-            BEFORE, [moving("world", "map", 0), static("tool", "map")], [1], id="a static sample after a moving one"
-        ),
-        pytest.param(
-            {},
-            [moving("a", "b", 0), moving("x", "y", 0), moving("b", "a", 0), moving("y", "x", 0)],
-            [3, 2],
-            id="two loops",
-        ),
-        pytest.param(
-            {"a": KnownEdge("b"), **edges_of(moving("b", "c", 5))},
-            [moving("a", "b", 0)],
-            [],
-            id="a parent that is remembered without a sample",
-        ),
-        pytest.param(
-            edges_of(moving("a", "b", 0), moving("b", "a", 0)),
-            [moving("a", "c", 5)],
-            [],
-            id="a loop that the batch does not change",
-        ),
+        pytest.param(CHAIN, "tool>base@10", [0], id="a sample at the newest stamp"),
+        pytest.param(CHAIN, "tool>base", [0], id="a static sample"),
+        pytest.param(CHAIN, "tool>map@-5", [0], id="the first sample of a child"),
+        pytest.param("map>base base>tool@10", "tool>base@1", [0], id="a moving sample of any stamp after a static one"),
+        pytest.param("a>b b>c", "c>a", [0], id="static edges"),
+        pytest.param(CHAIN, "base>map@11", [0], id="an edge turned round"),
+        pytest.param("", "a>b@0 b>c@0 c>a@0", [2], id="a loop inside the batch"),
+        pytest.param(CHAIN, "tool>map@11 tool>map@12 x>y@0", [1, 0], id="a loop that is closed twice"),
+        pytest.param(CHAIN, "world>map@11 tool>map@12", [1], id="only the newer of two parents"),
+        pytest.param(CHAIN, "world>map@0 tool>map", [1], id="a static sample after a moving one"),
+        pytest.param("", "a>b@0 x>y@0 b>a@0 y>x@0", [3, 2], id="two loops"),
+        pytest.param("a>b@0 b>a@0", "a>c@5", [], id="a loop that the batch does not change"),
     ],
 )
 def test_admit_refuses_the_last_samples_that_close_loops_of_newest_parents(
-    edges: dict[str, KnownEdge], batch: list[TransformStamped], refused: list[int]
+    before: str, batch: str, refused: list[int]
 ) -> None:
-    accepted, errors = admit(edges, batch, parents_of(edges))
-    assert accepted == tuple(sample for place, sample in enumerate(batch) if place not in refused)
+    edges, samples = edges_of(*samples_of(before)), samples_of(batch)
+    accepted, errors = admit(edges, samples, parents_of(edges))
+    assert accepted == tuple(sample for place, sample in enumerate(samples) if place not in refused)
     assert [(error.reason, error.parent, error.child) for error in errors] == [
-        ("cycle", batch[place].parent, batch[place].child) for place in refused
+        ("cycle", samples[place].parent, samples[place].child) for place in refused
     ]
 
 
@@ -150,6 +125,11 @@ def test_a_chain_that_grows_at_its_end_is_not_climbed() -> None:
         assert edges.reads < 10
 
 
+def test_a_parent_that_is_remembered_without_a_sample_closes_no_loop() -> None:
+    edges = {"a": KnownEdge("b"), **edges_of(moving("b", "c", 5))}
+    assert admit(edges, [moving("a", "b", 0)], parents_of(edges))[1] == []
+
+
 def test_names_that_are_no_longer_parents_do_no_harm() -> None:
     edges = edges_of(moving("a", "b", 0))
     assert admit(edges, [moving("b", "c", 0)], {"a", "c", "former"})[1] == []
@@ -163,43 +143,26 @@ def forest_with(*batch: TransformStamped) -> Forest:
     return made
 
 
-ON_A_FROM_5_TO_9 = [moving("b", "a", 5), moving("c", "a", 9)]
-ON_C_THEN = [moving("c", "a", 0), *ON_A_FROM_5_TO_9]
+FROM_5_TO_9 = "b>a@5 c>a@9"
 ROUND = ("b", "a", "b")
 
 
 @pytest.mark.parametrize(
     ("others", "sample", "loop"),
     [
-        pytest.param(ON_C_THEN, moving("a", "b", 5), Loop(5, ROUND), id="both hold at the stamp"),
-        pytest.param(ON_C_THEN, moving("a", "b", 3), Loop(5, ROUND), id="the other one begins later"),
-        pytest.param(ON_C_THEN, moving("a", "b", 9), None, id="it has ended"),
-        pytest.param([*ON_C_THEN, moving("d", "b", 5)], moving("a", "b", 3), None, id="the sample has ended"),
-        pytest.param(
-            [moving("c", "a", 0), moving("b", "a", 7), moving("c", "a", 9), moving("a", "b", 7)],
-            moving("a", "b", 3),
-            None,
-            id="the loop is that of the next sample",
-        ),
-        pytest.param(ON_A_FROM_5_TO_9, moving("a", "b", 3), Loop(5, ROUND), id="an edge begins with its oldest sample"),
-        pytest.param(ON_A_FROM_5_TO_9, moving("a", "b", 20), None, id="in order"),
-        pytest.param(ON_A_FROM_5_TO_9, static("a", "b"), Loop(5, ROUND), id="a static edge"),
-        pytest.param(
-            [static("x", "a"), moving("b", "x", 5), moving("c", "x", 9)],
-            moving("a", "b", 6),
-            Loop(6, ("b", "a", "x", "b")),
-            id="through a static edge",
-        ),
-        pytest.param(
-            [moving("a", "x", 0), moving("x", "a", 5), moving("c", "x", 9), moving("c", "a", 9)],
-            moving("a", "b", 5),
-            None,
-            id="above a loop of others",
-        ),
+        pytest.param(f"c>a@0 {FROM_5_TO_9}", "a>b@5", Loop(5, ROUND), id="both hold at the stamp"),
+        pytest.param(f"c>a@0 {FROM_5_TO_9}", "a>b@3", Loop(5, ROUND), id="the other one begins later"),
+        pytest.param(f"c>a@0 {FROM_5_TO_9}", "a>b@9", None, id="it has ended"),
+        pytest.param(f"c>a@0 {FROM_5_TO_9} d>b@5", "a>b@3", None, id="the sample has ended"),
+        pytest.param("c>a@0 b>a@7 c>a@9 a>b@7", "a>b@3", None, id="the loop is that of the next sample"),
+        pytest.param(FROM_5_TO_9, "a>b@3", Loop(5, ROUND), id="an edge begins with its oldest sample"),
+        pytest.param(FROM_5_TO_9, "a>b@20", None, id="in order"),
+        pytest.param(FROM_5_TO_9, "a>b", Loop(5, ROUND), id="a static edge"),
+        pytest.param("x>a b>x@5 c>x@9", "a>b@6", Loop(6, ("b", "a", "x", "b")), id="through a static edge"),
+        pytest.param("a>x@0 x>a@5 c>x@9 c>a@9", "a>b@5", None, id="above a loop of others"),
     ],
 )
-def test_the_first_loop_in_the_time_of_a_sample_is_found(
-    others: list[TransformStamped], sample: TransformStamped, loop: Loop | None
-) -> None:
-    frames = forest_with(*others, sample).frames
-    assert past_loop(frames, sample.child, STAMP_MIN if sample.static else sample.stamp) == loop
+def test_the_first_loop_in_the_time_of_a_sample_is_found(others: str, sample: str, loop: Loop | None) -> None:
+    (last,) = samples_of(sample)
+    frames = forest_with(*samples_of(others), last).frames
+    assert past_loop(frames, last.child, STAMP_MIN if last.static else last.stamp) == loop

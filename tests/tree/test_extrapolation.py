@@ -105,10 +105,6 @@ def test_a_gap_error_has_the_stamps_of_both_samples() -> None:
     error = caught.value
     assert (error.child, error.stamp, error.before, error.after) == ("robot", 2 * SECOND, SECOND, 4 * SECOND)
     assert (error.oldest, error.newest, error.max_gap) == (0, 4 * SECOND, SECOND)
-    assert str(error) == (
-        "frame 'robot': asked for 2.000 s, between samples at 1.000 s and 4.000 s, which are 3 s apart (at most 1 s), "
-        "from 'odometry'"
-    )
 
 
 def test_an_error_that_waiting_cannot_help_decides_else_that_of_the_edge_that_lags_most() -> None:
@@ -154,6 +150,7 @@ def seconds(value: float) -> int:
         (1.5, {"max_gap": 4.0}, 1.5 + 15.0 + 0.5, 0.0, 4.0),
         (3.0, {"max_gap": 4.0}, 3.0 + 30.0 + 0.5, 0.0, 4.0),
         (3.0, {"max_gap": 3.9, "tolerance": 1.0}, 2.0 + 40.0 + 0.5, 1.0, 0.0),
+        (2.0, {"max_gap": 3.9, "tolerance": 2.0}, 2.0 + 0.0 + 0.5, 2.0, 0.0),
         (4.5, {"tolerance": 0.5}, 4.5 + 40.0 + 0.5, 0.5, 4.0),
         (5.0, {"extrapolate": Hold(1.0)}, 5.0 + 40.0 + 0.5, 1.0, 4.0),
         (6.5, {"extrapolate": Hold(2.5)}, 6.0 + 40.0 + 0.5, 2.5, 0.0),
@@ -164,7 +161,8 @@ def seconds(value: float) -> int:
 def test_the_answer_has_its_extrapolation_and_gap(
     tree: TransformTree, at: float, policy: dict[str, Any], x: float, extrapolated_by: float, gap: float
 ) -> None:
-    for target, source, sign in (("odom", "tool", 1.0), ("tool", "odom", -1.0)):
+    # Twice, because the kernel answers from a path that is known.
+    for target, source, sign in (("odom", "tool", 1.0), ("tool", "odom", -1.0)) * 2:
         found = tree.lookup(target, source, seconds(at), **policy)
         assert found.transform.translation == pytest.approx((sign * x, 0.0, 0.0))
         assert (found.parent, found.child, found.stamp) == (target, source, seconds(at))
@@ -172,10 +170,14 @@ def test_the_answer_has_its_extrapolation_and_gap(
         assert ("extrapolated by" in str(found)) == (extrapolated_by > 0.0)
 
 
-def test_an_answer_without_a_policy_has_no_extrapolation_and_gap(tree: TransformTree) -> None:
+def test_an_answer_without_a_policy_has_no_extrapolation_and_gap_and_a_static_path_needs_none(
+    tree: TransformTree,
+) -> None:
     found = tree.lookup("odom", "tool", seconds(3.0))
     assert (found.extrapolated_by, found.gap) == (0, None)
     assert found == tree.lookup("odom", "tool", seconds(3.0), tolerance=0.1)
+    found = tree.lookup("arm", "tool", seconds(99.0), tolerance=0.1)
+    assert (found.static, found.extrapolated_by, found.gap) == (True, 0, 0)
 
 
 @pytest.mark.parametrize(
@@ -195,11 +197,6 @@ def test_the_error_names_the_deciding_edge(
         tree.lookup("odom", "tool", seconds(at), **policy)
     assert caught.value.child == child
     assert not tree.can_transform("odom", "tool", seconds(at), **policy)
-
-
-def test_static_paths_need_no_policy(tree: TransformTree) -> None:
-    found = tree.lookup("arm", "tool", seconds(99.0), tolerance=0.1)
-    assert (found.static, found.extrapolated_by, found.gap) == (True, 0, 0)
 
 
 def test_latest_in_the_gap_of_another_edge_waits_for_the_end_of_the_gap(tree: TransformTree) -> None:
@@ -222,10 +219,11 @@ def test_latest_in_the_gap_of_another_edge_waits_for_the_end_of_the_gap(tree: Tr
 def test_latest_goes_as_far_as_the_lagging_edge_may_be_held_but_not_beyond_the_newest(
     tree: TransformTree, policy: dict[str, Any], stamp: float, x: float, extrapolated_by: float
 ) -> None:
-    found = tree.lookup("odom", "arm", **policy)
-    assert found.stamp == seconds(stamp)
-    assert found.transform.translation[0] == pytest.approx(x)
-    assert found.extrapolated_by == seconds(extrapolated_by)
+    for _ in range(2):
+        found = tree.lookup("odom", "arm", **policy)
+        assert found.stamp == seconds(stamp)
+        assert found.transform.translation[0] == pytest.approx(x)
+        assert found.extrapolated_by == seconds(extrapolated_by)
 
 
 def test_time_travel_has_the_greater_extrapolation_and_gap_of_both_legs(tree: TransformTree) -> None:

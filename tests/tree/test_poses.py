@@ -66,19 +66,6 @@ def test_poses_of_turned_frames_with_stamps_of_their_own_are_those_of_lookups(
             check_against_lookups(tree, reader.read(fixed, at), fixed, at)
 
 
-def test_poses_of_a_frame_with_two_parents_are_those_of_lookups_at_every_stamp() -> None:
-    tree = tree_of(
-        *over("map", "odom", (0, 9)),
-        *(moving("map", "base", stamp, 2.0 + stamp) for stamp in (1, 3)),
-        *(moving("odom", "base", stamp, 7.0 + stamp) for stamp in (5, 8)),
-        static("base", "lidar", 1.0),
-    )
-    reader = PoseReader(forest_of(tree))
-    for fixed in tree.frames():
-        for at in (*range(11), LATEST):
-            check_against_lookups(tree, reader.read(fixed, at), fixed, at)
-
-
 def test_an_edge_without_a_sample_at_the_stamp_keeps_its_nearest_one() -> None:
     tree = tree_of(*over("map", "base", (10, 20)), static("base", "lidar", 1.0))
     late = read(tree, "map", 25)
@@ -98,10 +85,6 @@ def test_frames_behind_an_edge_without_samples_have_no_pose() -> None:
     poses = read(tree, "map")
     assert np.isnan(poses.columns[:, [poses.frames.index(frame) for frame in ("base", "lidar")]]).all()
     assert x_in(poses, "anchor") == 2.0
-
-
-def test_frames_of_another_tree_have_no_pose() -> None:
-    assert read(tree_of(static("map", "a"), static("world", "b")), "map").frames == ("map", "a")
 
 
 def test_an_unknown_fixed_frame_is_an_error() -> None:

@@ -17,7 +17,7 @@ from support.samples import moving, static, tree_of
 from support.strategies import TODAY, frame_names
 
 from tfbus import SECOND, Buffer, Bus, Edge, SimulatedClock, Transform, TransformStamped, TransformTree
-from tfbus.tree.history import EdgeState, state_of
+from tfbus.tree.history import EdgeState
 from tfbus.tree.rendering import describe, legend, to_dot, to_html, to_yaml
 
 MOVING = Edge("map", "base_link", False, 101, 2 * SECOND, 4 * SECOND, "odometry")
@@ -54,10 +54,6 @@ def test_a_branch_that_continues_is_drawn_beside_its_descendants() -> None:
     assert picture.split("\n") == ["map", "├── a      static", "│   └── b  static", "└── c      static"]
 
 
-def test_several_trees_are_drawn_one_below_the_other() -> None:
-    assert labels(describe([edge("odom", "base"), edge("map", "anchor")])) == ["map", "anchor", "odom", "base"]
-
-
 def test_an_empty_tree_has_a_text_and_an_empty_yaml() -> None:
     tree = TransformTree()
     assert tree.describe() == "(no frames)"
@@ -65,20 +61,16 @@ def test_an_empty_tree_has_a_text_and_an_empty_yaml() -> None:
     assert tree.to_dot() == "digraph tf {\n}\n"
 
 
-def test_a_loop_is_drawn_once_and_marked() -> None:
+def test_several_trees_are_drawn_one_below_the_other_and_a_loop_once_with_a_mark() -> None:
+    assert labels(describe([edge("odom", "base"), edge("map", "anchor")])) == ["map", "anchor", "odom", "base"]
     assert labels(describe([edge("b", "a"), edge("a", "b"), edge("map", "c")])) == ["map", "c", "a (in a loop)", "b"]
 
 
 @given(st.dictionaries(st.sampled_from("abcdefgh"), st.sampled_from("abcdefgh"), max_size=8))
-def test_every_frame_of_any_graph_is_drawn_once(parents: dict[str, str]) -> None:
+def test_every_frame_of_any_graph_is_drawn_once_and_only_those_in_loops_are_marked(parents: dict[str, str]) -> None:
     picture = describe([edge(parent, child) for child, parent in sorted(parents.items())])
     drawn = [label.removesuffix(" (in a loop)") for label in labels(picture)]
     assert sorted(drawn) == sorted({*parents, *parents.values()} or {"(no frames)"})
-
-
-@given(st.dictionaries(st.sampled_from("abcdefgh"), st.sampled_from("abcdefgh"), max_size=8))
-def test_only_frames_of_a_loop_are_marked_as_in_it(parents: dict[str, str]) -> None:
-    picture = describe([edge(parent, child) for child, parent in sorted(parents.items())])
     named = {label.removesuffix(" (in a loop)") for label in labels(picture) if label.endswith(" (in a loop)")}
     for frame in named:
         above = parents[frame]
@@ -266,13 +258,7 @@ def test_the_tree_has_a_line_with_the_facts_of_each_frame() -> None:
         "└── base       50.0 Hz  age 1 s  span 2 s  from 'odometry'",
         "    └── lidar  static  from 'driver'",
     ]
-
-
-def test_the_facts_can_be_left_out() -> None:
     assert plain(to_html(TWO_EDGES, 0, with_facts=False)) == ["map", "└── base", "    └── lidar"]
-
-
-def test_an_empty_tree_has_a_text() -> None:
     assert plain(to_html([], 0)) == ["(no frames)"]
 
 
@@ -283,9 +269,10 @@ def test_frames_have_the_colour_of_their_state() -> None:
     assert "; color" not in root
 
 
-def test_the_age_from_which_frames_are_stale_can_be_chosen() -> None:
-    for stale_after, state in ((1.0, EdgeState.MOVING), (0.9, EdgeState.STALE)):
-        assert f'color: {state.value}">base<' in to_html(TWO_EDGES, 5 * SECOND, stale_after)
+def test_the_age_from_which_frames_are_stale_can_be_chosen_and_one_ahead_of_the_clock_is_not_stale() -> None:
+    cases = ((5, 1.0, EdgeState.MOVING), (5, 0.9, EdgeState.STALE), (3, 0.1, EdgeState.MOVING))
+    for now, stale_after, state in cases:
+        assert f'color: {state.value}">base<' in to_html(TWO_EDGES, now * SECOND, stale_after)
 
 
 def test_marked_frames_stand_out() -> None:
@@ -327,21 +314,3 @@ def test_a_buffer_in_a_notebook_has_its_own_names_and_ages_by_the_clock() -> Non
         html = in_a_notebook(buffer)
     assert ">base<" in html
     assert "age 4 s" in html
-
-
-def newest_at(newest: int | None) -> Edge:
-    return Edge("map", "base", False, 0 if newest is None else 1, newest, newest, "")
-
-
-@pytest.mark.parametrize(
-    ("edge", "now", "state"),
-    [
-        pytest.param(newest_at(5 * SECOND), 6 * SECOND, EdgeState.MOVING, id="just recent enough"),
-        pytest.param(newest_at(5 * SECOND), 6 * SECOND + 1, EdgeState.STALE, id="one ns too old"),
-        pytest.param(newest_at(5 * SECOND), 4 * SECOND, EdgeState.MOVING, id="ahead of the clock"),
-        pytest.param(newest_at(None), 0, EdgeState.SILENT, id="no samples"),
-        pytest.param(Edge("map", "base", True, 1, None, None, ""), 9 * SECOND, EdgeState.STATIC, id="static"),
-    ],
-)
-def test_the_state_follows_from_kind_and_age(edge: Edge, now: int, state: EdgeState) -> None:
-    assert state_of(edge, now, stale_after=1.0) is state

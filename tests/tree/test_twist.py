@@ -69,10 +69,6 @@ def times(factor: float, vector: Vector) -> Vector:
     return factor * vector[0], factor * vector[1], factor * vector[2]
 
 
-def cross(a: Vector, b: Vector) -> Vector:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
 def check_twist(twist: TwistStamped, linear: Vector, angular: Vector, tolerance: float = 1e-9) -> None:
     assert twist.linear == near(linear, tolerance)
     assert twist.angular == near(angular, tolerance)
@@ -148,18 +144,6 @@ def test_twist_is_the_limit_of_differences(drawn: tuple[TransformTree, int, list
     twist = tree.twist(frame, reference, at, expressed_in=axes)
     check_twist(twist, rotate(turn, *linear), rotate(turn, *angular), tolerance=1e-6)
     assert (twist.frame, twist.stamp) == (axes, at)
-
-
-@given(trees(), st.data())
-def test_the_twist_of_b_seen_from_a_is_the_reverse_of_a_seen_from_b_about_the_lever_arm(
-    drawn: tuple[TransformTree, int, list[str]], data: st.DataObject
-) -> None:
-    tree, at, frames = drawn
-    a, b, axes = (data.draw(st.sampled_from(frames)) for _ in range(3))
-    there, back = tree.twist(a, b, at, expressed_in=axes), tree.twist(b, a, at, expressed_in=axes)
-    arm = rotate(tree.lookup(axes, b, at).transform.rotation, *tree.lookup(b, a, at).transform.translation)
-    linear = plus(times(-1.0, there.linear), cross(there.angular, arm))
-    check_twist(back, linear, times(-1.0, there.angular))
 
 
 @given(trees(), st.data(), transforms(2.0))
@@ -359,15 +343,9 @@ def test_a_stamp_is_an_integer_or_latest(at: object) -> None:
         lines_of_two_trees().twist("body", "map", at)  # type: ignore[arg-type]
 
 
-def gap(axes_first: bool) -> TransformTree:
-    """One of two frames has stopped before the other began."""
-    early, late = ("axes", "body") if axes_first else ("body", "axes")
-    first = [moving("map", early, second * SECOND) for second in (0, 1)]
-    return tree_of(*first, *(moving("map", late, second * SECOND) for second in (5, 6)))
-
-
-@pytest.mark.parametrize("axes_first", [True, False])
-def test_latest_without_a_common_stamp_waits_for_the_lagging_frame(axes_first: bool) -> None:
+@pytest.mark.parametrize(("early", "late"), [("axes", "body"), ("body", "axes")])
+def test_latest_without_a_common_stamp_waits_for_the_lagging_frame(early: str, late: str) -> None:
+    tree = tree_of(*(moving("map", early if second < 2 else late, second * SECOND) for second in (0, 1, 5, 6)))
     with pytest.raises(FutureExtrapolationError) as caught:
-        gap(axes_first).twist("body", "map", expressed_in="axes")
-    assert (caught.value.child, caught.value.stamp) == ("axes" if axes_first else "body", 5 * SECOND)
+        tree.twist("body", "map", expressed_in="axes")
+    assert (caught.value.child, caught.value.stamp) == (early, 5 * SECOND)

@@ -52,12 +52,16 @@ class Shown:
         anyio.from_thread.run_sync(self.bus.publish, batch)
 
 
+@pytest.fixture
+def shown() -> Shown:
+    return Shown()
+
+
 # The life of a page
 
 
 @pytest.mark.every_loop
-async def test_a_page_is_served_on_the_loopback_until_the_end(capfd: pytest.CaptureFixture[str]) -> None:
-    shown = Shown()
+async def test_a_page_is_served_on_the_loopback_until_the_end(shown: Shown, capfd: pytest.CaptureFixture[str]) -> None:
     async with View(shown.bus, shown.buffer, 0) as view:
         assert view.address.startswith("http://127.0.0.1:")
         assert view.viewers == 0
@@ -70,23 +74,20 @@ async def test_a_page_is_served_on_the_loopback_until_the_end(capfd: pytest.Capt
         pass
 
 
-async def test_a_port_that_is_taken_gives_way_to_the_next_one() -> None:
-    shown = Shown()
+async def test_a_port_that_is_taken_gives_way_to_the_next_one(shown: Shown) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         async with View(shown.bus, shown.buffer, port) as view:
             assert int(view.address.rpartition(":")[2]) > port
 
 
-async def test_an_address_of_another_machine_is_an_error_at_once() -> None:
-    shown = Shown()
+async def test_an_address_of_another_machine_is_an_error_at_once(shown: Shown) -> None:
     with pytest.raises(OSError, match="assign requested address"):
         async with View(shown.bus, shown.buffer, 0, host="192.0.2.1"):
             pytest.fail("entered")
 
 
-async def test_an_error_in_the_body_comes_out_as_it_is_and_ends_the_page() -> None:
-    shown = Shown()
+async def test_an_error_in_the_body_comes_out_as_it_is_and_ends_the_page(shown: Shown) -> None:
     [port] = free_ports(1)
     with pytest.raises(ZeroDivisionError):
         async with View(shown.bus, shown.buffer, port):
@@ -95,8 +96,7 @@ async def test_an_error_in_the_body_comes_out_as_it_is_and_ends_the_page() -> No
         pass
 
 
-async def test_a_view_is_entered_once_and_not_on_a_closed_bus() -> None:
-    shown = Shown()
+async def test_a_view_is_entered_once_and_not_on_a_closed_bus(shown: Shown) -> None:
     view = View(shown.bus, shown.buffer, 0)
     async with view:
         pass
@@ -107,8 +107,7 @@ async def test_a_view_is_entered_once_and_not_on_a_closed_bus() -> None:
         await View(shown.bus, shown.buffer, 0).__aenter__()
 
 
-async def test_a_page_outlives_its_bus() -> None:
-    shown = Shown()
+async def test_a_page_outlives_its_bus(shown: Shown) -> None:
     async with View(shown.bus, shown.buffer, 0) as view:
         shown.bus.close()
         async with httpx.AsyncClient(trust_env=False) as client:
@@ -418,8 +417,7 @@ async def test_what_pages_send_cannot_end_the_program(caplog: pytest.LogCaptureF
     assert [record for record in caplog.records if record.levelname == "ERROR"] == []
 
 
-async def test_the_origins_that_may_use_the_page_are_named(caplog: pytest.LogCaptureFixture) -> None:
-    shown = Shown()
+async def test_the_origins_that_may_use_the_page_are_named(shown: Shown, caplog: pytest.LogCaptureFixture) -> None:
     async with View(shown.bus, shown.buffer, 0, origins=["http://robot.example"]) as view:
         for host, status in (("robot.example", 200), ("evil.example", 403)):
             async with httpx.AsyncClient(trust_env=False) as client:
@@ -495,8 +493,7 @@ on_one_loop = pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["
 
 
 @look
-async def test_a_moving_frame_moves_and_a_click_shows_where_it_is() -> None:
-    shown = Shown()
+async def test_a_moving_frame_moves_and_a_click_shows_where_it_is(shown: Shown) -> None:
     # The camera looks at the middle, x = 5, where the tool is not at first.
     shown.bus.publish([static("map", "left", -20.0), static("map", "right", 30.0)])
     tf = TransformBroadcaster(shown.bus, "arm")
@@ -530,9 +527,8 @@ async def test_a_moving_frame_moves_and_a_click_shows_where_it_is() -> None:
 
 @look
 @on_one_loop
-async def test_names_of_frames_are_texts_and_never_elements() -> None:
+async def test_names_of_frames_are_texts_and_never_elements(shown: Shown) -> None:
     evil = "<img src=x onerror=document.title='owned'>"
-    shown = Shown()
     shown.bus.publish([static(evil, f"{evil}{{1+1}}", 1.0), static(evil, "**b**", 2.0)])
     async with View(shown.bus, shown.buffer, 0) as view:
         view.add_points(PointCloud("**b**", LATEST, np.zeros((3, 3))), name=evil)

@@ -37,7 +37,7 @@ def test_a_sample_wakes_exactly_the_waiters_whose_stamp_it_covers() -> None:
     assert woken == []
     live.insert((moving("map", "a", 4),))
     assert woken == ["a", "a"]
-    assert [pending.question.at for pending in live.waiting.pending()] == [5, 3]
+    assert [waiter.question.at for waiter in live.waiting.parked] == [5, 3]
 
 
 def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
@@ -168,4 +168,4 @@ def test_an_interrupt_of_one_wake_up_keeps_no_other_from_being_woken() -> None:
     with pytest.raises(KeyboardInterrupt):
         live.insert((moving("map", "a", 5),))
     assert woken == ["a"]
-    assert live.waiting.pending() == ()
+    assert live.waiting.parked == {}

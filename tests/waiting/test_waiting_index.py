@@ -18,6 +18,11 @@ from tfbus.waiting import live_tree
 from tfbus.waiting.live_tree import Waiter, WaitingIndex, without_traceback
 
 
+@pytest.fixture
+def index() -> WaitingIndex:
+    return WaitingIndex()
+
+
 def waiter(wake: Callable[[], object] = list) -> Waiter:
     return Waiter(Question("map", "tool", LATEST), since=0, wake=wake)
 
@@ -40,16 +45,14 @@ def parked(index: WaitingIndex, error: TransformLookupError) -> Waiter:
     return made
 
 
-def test_parking_with_an_error_that_waiting_cannot_help_is_a_type_error() -> None:
-    index = WaitingIndex()
+def test_parking_with_an_error_that_waiting_cannot_help_is_a_type_error(index: WaitingIndex) -> None:
     with pytest.raises(TypeError, match="waiting cannot help"):
         index.park(waiter(), PastExtrapolationError(child="tool", stamp=1, oldest=2, newest=3))
     assert len(index) == 0
     assert index.pop_all() == []
 
 
-def test_a_waiter_is_looked_at_when_any_frame_passes_its_first_limit() -> None:
-    index = WaitingIndex()
+def test_a_waiter_is_looked_at_when_any_frame_passes_its_first_limit(index: WaitingIndex) -> None:
     early, late, without = waiter(), waiter(), waiter()
     index.park(late, short_of("tool", 5), [("arm", 40), ("hand", 30)])
     index.park(early, short_of("tool", 5), [("arm", 20)])
@@ -62,8 +65,7 @@ def test_a_waiter_is_looked_at_when_any_frame_passes_its_first_limit() -> None:
     assert index.limit > 2**63
 
 
-def test_under_a_limit_that_some_frame_has_passed_a_waiter_is_given_by_its_own_frame_only() -> None:
-    index = WaitingIndex()
+def test_under_a_limit_that_some_frame_has_passed_a_waiter_is_given_by_its_own_frame_only(index: WaitingIndex) -> None:
     index.pop_limited(100)
     waiting = waiter()
     index.park(waiting, short_of("tool", 5), [("arm", 40), ("hand", 30), ("base", 100)])
@@ -75,8 +77,7 @@ def test_under_a_limit_that_some_frame_has_passed_a_waiter_is_given_by_its_own_f
     assert index.limit > 2**63
 
 
-def test_a_waiter_that_is_blocked_and_limited_by_one_frame_is_given_once() -> None:
-    index = WaitingIndex()
+def test_a_waiter_that_is_blocked_and_limited_by_one_frame_is_given_once(index: WaitingIndex) -> None:
     index.pop_limited(100)
     waiting = waiter()
     index.park(waiting, disconnected("map", "odom"), [("map", 10), ("map", 20), ("odom", 10)])
@@ -84,8 +85,7 @@ def test_a_waiter_that_is_blocked_and_limited_by_one_frame_is_given_once() -> No
     assert index.by_frame == {}
 
 
-def test_new_limits_of_a_waiter_replace_the_old_ones() -> None:
-    index = WaitingIndex()
+def test_new_limits_of_a_waiter_replace_the_old_ones(index: WaitingIndex) -> None:
     waiting = waiter()
     index.park(waiting, short_of("tool", 500), [("arm", 10), ("hand", 50)])
     assert index.pop_limited(20) == [waiting]
@@ -98,10 +98,10 @@ def test_new_limits_of_a_waiter_replace_the_old_ones() -> None:
     assert index.by_frame == {}
 
 
-def test_the_names_are_those_of_all_questions_of_parked_waiters() -> None:
-    index = WaitingIndex()
+def test_the_names_are_those_of_all_questions_of_parked_waiters(index: WaitingIndex) -> None:
     plain = waiter()
-    wide = Waiter(Question("map", "laser", 5, 5, "odom"), 0, list, others=(Question("base", "laser", 7),))
+    wide = Waiter(Question("map", "laser", 5, 5, "odom"), 0, list)
+    wide.others = (Question("base", "laser", 7),)
     index.park(plain, unknown("tool"))
     index.park(wide, unknown("laser"))
     assert set(index.names) == {"map", "tool", "laser", "odom", "base"}
@@ -162,9 +162,8 @@ def test_no_reference_cycle_keeps_a_waiter_that_has_left_the_index(
 
 @pytest.mark.parametrize("others_need", [4, 6])
 def test_a_waiter_for_which_there_is_no_memory_leaves_nothing_and_disturbs_no_other(
-    monkeypatch: pytest.MonkeyPatch, others_need: int
+    index: WaitingIndex, monkeypatch: pytest.MonkeyPatch, others_need: int
 ) -> None:
-    index = WaitingIndex()
     other = parked(index, short_of("tool", others_need))
 
     def fail(_places: list[Any], _place: Any) -> None:

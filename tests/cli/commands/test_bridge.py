@@ -3,7 +3,6 @@ import os
 import anyio
 import anyio.to_thread
 import pytest
-from support.commands import Command, check_wrong_call
 from support.processes import free_address, new_domain, start_tfbus, until
 from support.samples import latched, moving, static
 
@@ -87,14 +86,3 @@ def test_frames_pass_between_a_domain_of_this_machine_and_a_router_and_between_t
     ):
         assert echo.output.expect("Translation") == "- Translation: [1.000000, 2.000000, 3.000000] m"
         assert bridge.end() == 130
-
-
-def test_a_bridge_has_two_ends(tfbus: Command) -> None:
-    for words in (("dds", "dds"), ("tf", "domain:tf"), ("dds", "dds", "--connect", "tcp/127.0.0.1:1")):
-        check_wrong_call(tfbus("bridge", *words), "two places")
-
-
-def test_ros_that_is_not_there_is_a_usage_error(tfbus: Command) -> None:
-    pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
-    for words in (("bridge", "ws://127.0.0.1:1", "tf"), ("echo", "map", "base", "--ros", "ws://127.0.0.1:1")):
-        check_wrong_call(tfbus(*words), "cannot join ROS at ws://127.0.0.1:1: ")

@@ -1,7 +1,7 @@
 import json
 from pathlib import Path
 
-from support.commands import START, Command, check_wrong_call
+from support.commands import START, Command
 from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
@@ -61,8 +61,3 @@ def test_a_domain_is_examined_for_some_time(tfbus: Command) -> None:
     assert done.returncode == 1
     assert "listening to domain 'yard' for 3 s" in done.stderr
     assert [finding["kind"] for finding in json.loads(done.stdout)] == ["stamps go back", "ahead"]
-
-
-def test_a_part_of_a_domain_is_a_wrong_call(tmp_path: Path, tfbus: Command) -> None:
-    check_wrong_call(tfbus("check", "yard", "--from", "1"), "there is no file 'yard'")
-    check_wrong_call(tfbus("check", tmp_path / "missing.mcap"), "there is no such file")

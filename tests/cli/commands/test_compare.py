@@ -63,20 +63,6 @@ def test_what_cannot_be_aligned_is_warned_of(tmp_path: Path, tfbus: Command) -> 
     assert "their points lie on a line" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        (("--pair", "base"), "a pair is TARGET:SOURCE"),
-        (("--pair", "map:base", "--csv", "--json"), "give one of them"),
-        (("--pair", "map:base", "--delta", "0"), "delta must be at least 1"),
-    ],
-)
-def test_a_wrong_call_is_one_line_and_status_2(
-    both: tuple[Path, Path], options: tuple[str, ...], why: str, tfbus: Command
-) -> None:
-    check_wrong_call(tfbus("compare", *both, *options), why)
-
-
 def test_a_scale_is_told_and_what_is_left_out_of_a_recording_too(tmp_path: Path, tfbus: Command) -> None:
     folder = tmp_path / "run"
     folder.mkdir()

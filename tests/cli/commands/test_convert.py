@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 from support.commands import Command, check_wrong_call
-from support.recorded import SMALL, batches_in, write_mcap
+from support.recorded import batches_in, write_mcap
 from support.samples import moving, static
 
 LINES = [
@@ -44,21 +44,6 @@ def test_without_statics_the_file_is_an_empty_list(tmp_path: Path, tfbus: Comman
     path, statics = write_mcap(tmp_path / "run.mcap", LINES[1:]), tmp_path / "statics.yaml"
     tfbus("convert", path, tmp_path / "out.mcap", "--static-to-yaml", statics)
     assert statics.read_text() == "[]\n"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        (("out.mcap",), "at last the new file"),
-        ((SMALL, "out.csv"), "must end in .mcap, .bag, .db3"),
-        ((SMALL, "out.mcap", "--rename", "base"), "--rename is OLD=NEW"),
-        ((SMALL, "out.mcap", "--rename", "base=/x"), "must not start with '/'"),
-        ((SMALL, "missing/out.mcap"), "cannot write missing/out.mcap"),
-        (("missing.bag", "out.mcap"), "there is no such file"),
-    ],
-)
-def test_a_wrong_call_is_one_line_and_status_2(arguments: tuple[object, ...], why: str, tfbus: Command) -> None:
-    check_wrong_call(tfbus("convert", *arguments), why)
 
 
 def test_what_is_left_out_is_told_with_its_details(tmp_path: Path, tfbus: Command) -> None:

@@ -1,10 +1,9 @@
 import json
-from collections.abc import Sequence
 
 import anyio
 import anyio.to_thread
 import pytest
-from support.commands import Command, check_wrong_call
+from support.commands import Command
 from support.processes import new_domain, start_tfbus
 from support.samples import moving, static
 
@@ -131,22 +130,6 @@ def test_remote_transforms_come_from_the_buffer_of_another_program() -> None:
                     assert echo.end() == 130
 
     anyio.run(serve)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        (("map", "/base_link"), "write 'base_link'"),
-        (("", "base_link"), "must not be empty"),
-        (("map",), "SOURCE"),
-        (("map", "base_link", "--remote", "--robots", "r1", "--robots", "r2"), "one robot"),
-        (("map", "base_link", "--remote", "--robots", "a/b"), "robot"),
-    ],
-)
-def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
-    arguments: Sequence[str], why: str, tfbus: Command
-) -> None:
-    check_wrong_call(tfbus("echo", *arguments), why)
 
 
 def test_numbers_and_frames_are_on_lines_of_their_own_where_they_do_not_fit() -> None:

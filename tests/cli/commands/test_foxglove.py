@@ -30,12 +30,3 @@ def test_a_port_that_is_taken_is_a_usage_error(tfbus: Command) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         done = tfbus.on_domain(wait, "foxglove", "--port", str(taken.getsockname()[1]))
     check_wrong_call(done, "cannot listen at 127.0.0.1")
-
-
-def test_a_port_that_does_not_exist_is_a_usage_error(tfbus: Command) -> None:
-    for port in ("-1", "65536"):
-        check_wrong_call(tfbus("foxglove", "--port", port), "--port")
-
-
-def test_an_origin_that_is_none_is_a_usage_error(tfbus: Command) -> None:
-    check_wrong_call(tfbus("foxglove", "--origin", "robot.example"), "robot.example")

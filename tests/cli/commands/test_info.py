@@ -3,7 +3,7 @@ import re
 from pathlib import Path
 
 import pytest
-from support.commands import Command, check_wrong_call
+from support.commands import Command
 from support.recorded import SMALL, WRONG_IN_SMALL, Line, write_mcap
 from support.samples import moving, static
 
@@ -103,27 +103,6 @@ def test_a_recording_without_transforms_has_no_table(tmp_path: Path, tfbus: Comm
     head, topics = done.stdout.split("\n\n")
     assert head.splitlines()[-3:-1] == ["contents  0 transforms in 0 messages", "frames    0"]
     assert topics.splitlines()[0].split() == ["topic", "type", "messages", "read"]
-
-
-@pytest.mark.parametrize(
-    ("content", "why"),
-    [
-        (None, "there is no such file"),
-        (b"", "the file is empty"),
-        (b"\x89MCAP0\r\n\x01", "the file ends before its first message"),
-        (b"Dear diary,\n", "it is not a recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)"),
-        (b"#ROSBAG V2.0\n", "the file ends before its first message"),
-    ],
-    ids=["missing", "empty", "truncated", "foreign", "truncated bag"],
-)
-def test_a_file_that_is_no_recording_is_one_line_and_status_2(
-    tmp_path: Path, content: bytes | None, why: str, tfbus: Command
-) -> None:
-    path = tmp_path / "run.mcap"
-    if content is not None:
-        path.write_bytes(content)
-    for words in (("info", path), ("query", path, "a", "b"), ("play", path)):
-        check_wrong_call(tfbus(*words), f"recording '{path}': {why}")
 
 
 def test_all_lines_fit_80_columns_and_what_matters_least_is_left_out(

@@ -2,7 +2,7 @@ import json
 import re
 
 import pytest
-from support.commands import Command, check_wrong_call
+from support.commands import Command
 from support.samples import moving, static
 
 from tfbus import SECOND, Bus
@@ -73,7 +73,3 @@ def test_the_way_between_two_frames_is_folded_and_indented_on_a_narrow_terminal(
     assert len(folded) > 1
     assert all(line.startswith("  ") and line[2] != " " for line in folded)
     assert " ".join([first, *(line.strip() for line in folded)]) == whole
-
-
-def test_half_a_pair_is_a_usage_error(tfbus: Command) -> None:
-    check_wrong_call(tfbus("monitor", "map"), "'map' has no SOURCE")

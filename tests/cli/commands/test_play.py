@@ -15,7 +15,7 @@ from typing import Any
 
 import anyio
 import pytest
-from support.commands import Command, Done, Terminal, check_wrong_call, nobody
+from support.commands import Command, Done, Terminal, nobody
 from support.processes import PATIENCE, TFBUS, free_address, new_domain, start_tfbus, until
 from support.recorded import SMALL, WRONG_IN_SMALL, messages_in, write_mcap
 from support.rosbridge import rosbridge_server
@@ -174,21 +174,6 @@ def test_others_follow_the_clock_of_the_recording(ten_seconds: Path, backend: st
             assert at_first <= int(found[0]) / SECOND <= at_first + 10
             assert tree.wait() == 0
         assert player.end() == 130
-
-
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        (("--from=-1",), "expected a time from the beginning on"),
-        (("--from", "10.1"), "is 10.000 s long"),
-        (("--from", "5", "--to", "4.9"), "--to must not be before --from"),
-        (("--to", "1970-01-01"), "--to must not be before"),
-    ],
-)
-def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
-    ten_seconds: Path, arguments: Sequence[str], why: str, tfbus: Command
-) -> None:
-    check_wrong_call(tfbus("play", ten_seconds, *arguments), why)
 
 
 @pytest.mark.anyio

@@ -77,22 +77,6 @@ def test_text_prints_the_curves(recording: Path, tfbus: Command) -> None:
     assert "0.000 to 3.000 m" in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        (("map", "-o", "a.png"), "at least one source"),
-        (("map", "base", "-o", "a.gif"), ".png, .svg or .pdf"),
-        (("--gaps", "--path"), "--gaps"),
-        (("map", "base", "--text", "--path"), "--text"),
-        pytest.param(("map", "base", "-o", "nowhere/a.png"), "cannot write nowhere/a.png", marks=pytest.mark.thorough),
-    ],
-)
-def test_what_cannot_be_drawn_is_a_usage_error(
-    recording: Path, tfbus: Command, arguments: tuple[str, ...], why: str
-) -> None:
-    check_wrong_call(tfbus("plot", recording, *arguments), why)
-
-
 def test_without_a_display_the_error_names_the_ways_out(
     recording: Path, tfbus: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -142,27 +142,6 @@ def test_edges_that_never_overlap_are_a_failed_lookup(tmp_path: Path, tfbus: Com
     assert "frame 'b': asked for 0.000000007 s, newest sample is 0.000000004 s" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        (("--csv", "--json"), "give one of them"),
-        (("--tum", "--parquet", "x"), "give one of them"),
-        (("map", "arm", "--tum"), "ask for one pair"),
-        (("map",), "has no SOURCE"),
-        (("--topic", "/a", "--namespaces"), "give one of them"),
-        (("--stamps-of", "/nothing"), "nothing is on topic"),
-        (("--at", "1", "--every", "1"), "give one of them"),
-        (("--every", "0"), "more than 0 s"),
-        (("--every", "0.000000001"), "there would be 10,000,000,001 lines"),
-    ],
-)
-def test_a_wrong_call_is_one_line_and_status_2(
-    recording: Path, options: tuple[str, ...], why: str, tfbus: Command
-) -> None:
-    done = tfbus("query", recording, "map", "base", *options)
-    check_wrong_call(done, why)
-
-
 def test_invalid_transforms_of_the_recording_are_counted_on_standard_error(tfbus: Command) -> None:
     done = tfbus("query", SMALL, "map", "base_link", "--csv")
     assert done.returncode == 0

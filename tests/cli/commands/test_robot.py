@@ -57,8 +57,6 @@ r1/base
 └── r1/kite      wind    floating   xyz 1 2 3 m, rpy 3.14159 0 0 rad
 """
 
-ARM = Path(__file__).parents[3] / "demos" / "robot_arm.urdf"
-
 
 @pytest.fixture
 def crane(tmp_path: Path) -> str:
@@ -202,36 +200,6 @@ def test_where_the_tree_does_not_fit_types_and_joints_go_and_mimics_are_shortene
         assert max(map(len, lines)) <= width
         assert len(lines) == len(whole)
         assert all("revolute" not in line for line in lines)
-
-
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        (("elbw=1",), "the URDF comes first: tfbus robot FILE elbw=1"),
-        ((ARM, "elbw=1"), "'arm' has no joint 'elbw', did you mean 'elbow_flex'?"),
-        ((ARM, "wrist=1"), "did you mean 'wrist_flex' or 'wrist_roll'?"),
-        ((ARM, "shoulderpan=1"), "did you mean 'shoulder_pan' or 'shoulder_lift'?"),
-    ],
-)
-def test_a_misspelt_joint_is_suggested_by_any_word_of_its_name(
-    words: Sequence[object], why: str, tfbus: Command
-) -> None:
-    done = tfbus("robot", *words)
-    check_wrong_call(done, why)
-    assert ("did you mean" in done.stderr) is ("did you mean" in why)
-
-
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [(("--follow",), "give --ros"), (("shoulder=1", "--follow", "--ros", "dds"), "give none")],
-)
-def test_following_needs_ros_and_no_positions(tfbus: Command, words: tuple[str, ...], why: str) -> None:
-    check_wrong_call(tfbus("robot", "arm.urdf", *words), why)
-
-
-@pytest.mark.parametrize("words", [(), ("--follow",), ("--follow", "--tree", "--ros", "dds")])
-def test_without_a_urdf_that_of_ros_is_followed(tfbus: Command, words: tuple[str, ...]) -> None:
-    check_wrong_call(tfbus("robot", *words), "give")
 
 
 class Ros:

@@ -79,7 +79,3 @@ def test_an_address_in_use_is_a_usage_error(tfbus: Command) -> None:
         address = f"tcp/127.0.0.1:{server.getsockname()[1]}"
         done = tfbus("router", "--listen", address)
     check_wrong_call(done, f"cannot listen at {address}: {os.strerror(errno.EADDRINUSE)}")
-
-
-def test_an_address_that_no_program_can_have_is_a_usage_error(tfbus: Command) -> None:
-    check_wrong_call(tfbus("router", "--listen", "7447"), "an address is like tcp/")

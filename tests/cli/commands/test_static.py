@@ -1,6 +1,5 @@
 import json
 import math
-from collections.abc import Sequence
 from pathlib import Path
 
 import anyio.lowlevel
@@ -50,39 +49,6 @@ def test_it_publishes_one_static_transform_for_everybody_until_ctrl_c(
     assert (sample.parent, sample.child, sample.stamp) == ("base_link", "laser", START)
     assert (sample.authority, sample.static) == (authority, True)
     assert sample.transform.is_close(transform)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        (("a", "b", "--rpy", "0", "0", "1", "--quaternion", "0", "0", "0", "1"), "give one of them"),
-        (("a", "b", "--quaternion", "0", "0", "0", "0"), "zero quaternion"),
-        (("a", "b", "--quaternion", "0", "0", "0", "2"), "its norm is 2"),
-        (("a", "b", "--xyz", "nan", "0", "0"), "not finite"),
-        (("a", "b", "--xyz", "1", "2", "x"), "--xyz"),
-        (("a", "a"), "its own parent"),
-        (("/a", "b"), "write 'a'"),
-        (("", "b"), "must not be empty"),
-        (("a", "\udcff"), "UTF-8"),
-        (("a", "--xyz", "1", "2", "3"), "CHILD"),
-        (("a", "b", "c"), "'c'"),
-        (("a", "b", "--rpy", "0", "0", "1", "--rpy-deg", "0", "0", "1"), "--rpy and --rpy-deg"),
-        (("a", "b", "--rpy-deg", "0", "nan", "0"), "not finite"),
-        (("calibration.yaml",), "there is no such file"),
-        # tf2 has x y z yaw pitch roll, or a quaternion, before the frames; ROS 1 has a period behind them.
-        (["1", "-2", "3", "0.1", "0.2", "0.3", "a", "b"], "type tfbus static a b --xyz 1 -2 3 --rpy 0.3 0.2 0.1"),
-        (["1", "2", "3", "0", "0", "0", "1", "a", "b"], "type tfbus static a b --xyz 1 2 3 --quaternion 0 0 0 1"),
-        (
-            ["-1", "2", "3", "0.1", "0.2", "0.3", "a", "b", "100"],
-            "type tfbus static a b --xyz -1 2 3 --rpy 0.3 0.2 0.1",
-        ),
-        (["1", "2", "3", "a", "b"], "expected PARENT and CHILD"),
-    ],
-)
-def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
-    arguments: Sequence[str], why: str, tfbus: Command
-) -> None:
-    check_wrong_call(tfbus("static", *arguments), why)
 
 
 def test_degrees_are_degrees_and_an_angle_of_more_than_a_turn_is_questioned(tfbus: Command) -> None:

@@ -58,25 +58,3 @@ def test_a_recording_is_no_live_page_and_has_the_options_of_the_command(
     named = {"origins": ("https://robot.example",), "fixed": "map", "trails": ("base",), "rate": 5.0, "live": False}
     by_default = {"host": "127.0.0.1", "urdf": None, "package_paths": ()}
     assert given == {"port": 8081, "edges": 1, **named, **by_default}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        (("nowhere.bag",), "there is no such file"),
-        (("RUN", "--fixed", "/map"), "/map"),
-        (("RUN", "--trail", ""), "empty"),
-        (("RUN", "--port", "65536"), "--port"),
-        (("RUN", "--urdf", "nowhere.urdf"), "cannot use nowhere.urdf: No such file"),
-        (("RUN", "--urdf", "RUN"), "not well-formed"),
-    ],
-)
-def test_what_cannot_be_shown_is_a_usage_error(
-    tmp_path: Path, tfbus: Command, arguments: tuple[str, ...], why: str
-) -> None:
-    recording = write_mcap(tmp_path / "run.mcap", [(0, "/tf", [moving("map", "base", 5)])])
-    check_wrong_call(tfbus("view", *(recording if each == "RUN" else each for each in arguments)), why)
-
-
-def test_an_origin_that_is_none_is_a_usage_error(tfbus: Command) -> None:
-    check_wrong_call(tfbus("view", "--origin", "robot.example"), "robot.example")

@@ -3,9 +3,9 @@ import json
 import math
 import struct
 import sys
-import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager, contextmanager
+from functools import partial
 from itertools import count
 from pathlib import Path
 from random import Random
@@ -18,13 +18,13 @@ import pytest
 import zenoh
 import zenoh.ext
 from rosbags.typesys import Stores, get_typestore
-from support.both_sides import SECONDS, Node, Program, meet, node
+from support.both_sides import SECONDS, Node, check_killed_node, check_link_that_came_back, meet, node
 from support.damage import damaged
 from support.joint_messages import joint_state
 from support.processes import free_ports, until
 from support.samples import latched, moving, static
 
-from tfbus import SECOND, Buffer, Bus, PeerRejected, SimulatedClock, TransformStamped
+from tfbus import Bus, PeerRejected, SimulatedClock, TransformStamped
 from tfbus.links.rmw_zenoh import RmwZenohLink, rmw_zenoh_link
 from tfbus.links.rmw_zenoh.rmw_zenoh_link import (
     CLOCK_HASH,
@@ -296,27 +296,10 @@ async def test_a_node_of_another_program_both_ways_with_every_answer_right() -> 
 
 @pytest.mark.thorough
 async def test_a_node_of_another_program_is_heard_again_when_it_is_back_and_a_link_too() -> None:
-    with Bus() as bus, Buffer(bus) as buffer:
-        async with router() as address:
-            async with RmwZenohLink(bus, address, DOMAIN):
-                with sdk_peer(address, 60.0):
-                    await buffer.lookup("base", "laser", timeout=20.0)
-                # Killed without a word: a new one says something else.
-                with sdk_peer(address, 60.0, x=0.75):
-                    await until(lambda: latched(bus)["laser"].transform.translation[0] == 0.75)
-            with sdk_peer(address, 3.0) as ros:
-                assert (await ros.next_line())["event"] == "up"
-                program = Program(bus, buffer)
-                for _ in range(2):
-                    async with RmwZenohLink(bus, address, DOMAIN), anyio.create_task_group() as tasks:
-                        tasks.start_soon(program.send)
-                        # A stamp that nobody has sent yet.
-                        await buffer.lookup("odom", "tool", time.time_ns() + SECOND // 10, timeout=20.0)
-                        await anyio.sleep(1.0)
-                        tasks.cancel_scope.cancel()
-                facts = await ros.next_line()
-    assert facts["answered"] > 10
-    assert facts["wrong"] == 0
+    async with router() as address:
+        with Bus() as bus:
+            await check_killed_node(RmwZenohLink(bus, address, DOMAIN), bus, partial(sdk_peer, address))
+        await check_link_that_came_back(lambda bus: RmwZenohLink(bus, address, DOMAIN), sdk_peer(address, 3.0))
 
 
 @pytest.mark.thorough

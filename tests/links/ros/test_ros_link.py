@@ -130,6 +130,11 @@ def test_what_cannot_be_a_topic_is_refused(topic: Any) -> None:
         as_topics(topic, "tf")
 
 
+@pytest.fixture
+def end() -> RosEnd:
+    return RosEnd()
+
+
 def test_what_comes_from_ros_has_the_node_as_its_authority_and_the_kind_of_its_topic() -> None:
     end = RosEnd()
     end.hear(moving("map", "base", 5, 1.0), moving("base", "arm", 6, 2.0))
@@ -152,8 +157,7 @@ def test_what_comes_from_ros_has_the_node_as_its_authority_and_the_kind_of_its_t
     assert end.heard == [(moving("map", "base", 5, authority="robot"),)]
 
 
-def test_what_the_bus_refuses_is_counted_by_reason_and_announced_once_and_the_rest_is_published() -> None:
-    end = RosEnd()
+def test_what_the_bus_refuses_is_counted_by_reason_and_announced_once_and_the_rest_is_published(end: RosEnd) -> None:
     with end.bus.events() as events:
         for stamp in (1, 2):
             own_parent = named(encode([moving("self", "also", stamp)]), "also", "self")
@@ -186,8 +190,7 @@ def test_moving_frames_of_a_turn_go_out_together_and_static_ones_with_all_others
     assert (end.report.messages, end.report.samples) == (4, 7)
 
 
-def test_a_removed_static_frame_is_missing_in_the_next_message_and_a_moving_one_is_counted() -> None:
-    end = RosEnd()
+def test_a_removed_static_frame_is_missing_in_the_next_message_and_a_moving_one_is_counted(end: RosEnd) -> None:
     end.say(static("map", "lidar"), static("map", "camera"), moving("map", "base", 1))
     end.bus.remove_frame("lidar")
     end.bus.remove_frame("base")
@@ -200,15 +203,13 @@ def test_a_removed_static_frame_is_missing_in_the_next_message_and_a_moving_one_
     assert ["'base'" in str(error) for error in end.errors] == [True]
 
 
-def test_a_static_frame_that_begins_to_move_leaves_the_latched_message() -> None:
-    end = RosEnd()
+def test_a_static_frame_that_begins_to_move_leaves_the_latched_message(end: RosEnd) -> None:
     end.say(static("map", "lidar"), static("map", "camera"))
     end.say(moving("map", "lidar", 5))
     assert end.carrier.said[1:] == [(False, [("map", "lidar", 5)]), (True, [("map", "camera", 0)])]
 
 
-def test_what_a_message_cannot_hold_is_counted_and_the_rest_goes_out() -> None:
-    end = RosEnd()
+def test_what_a_message_cannot_hold_is_counted_and_the_rest_goes_out(end: RosEnd) -> None:
     end.say(moving("map", "late", 2**62), moving("map", "base", 1), static("map", "x" * 2_000), static("map", "b"))
     assert end.carrier.said == [(False, [("map", "base", 1)]), (True, [("map", "b", 0)])]
     assert end.report.not_sent == {"stamp": 1, "frame name": 1}
@@ -216,8 +217,7 @@ def test_what_a_message_cannot_hold_is_counted_and_the_rest_goes_out() -> None:
     assert end.report.not_sent == {"stamp": 1, "frame name": 1}, "once for each sample"
 
 
-def test_many_moving_frames_go_out_in_several_messages() -> None:
-    end = RosEnd()
+def test_many_moving_frames_go_out_in_several_messages(end: RosEnd) -> None:
     end.say(*(moving("map", f"f{number}", 1) for number in range(2 * MOST_TRANSFORMS + 1)))
     assert [len(rows) for _, rows in end.carrier.said] == [MOST_TRANSFORMS, MOST_TRANSFORMS, 1]
     assert [row[1] for _, rows in end.carrier.said for row in rows] == [f"f{n}" for n in range(2 * MOST_TRANSFORMS + 1)]
@@ -260,8 +260,7 @@ def test_a_link_that_only_listens_sends_nothing() -> None:
     assert (end.report.messages, end.report.not_sent) == (0, {})
 
 
-def test_what_ros_gives_back_is_no_news() -> None:
-    end = RosEnd()
+def test_what_ros_gives_back_is_no_news(end: RosEnd) -> None:
     end.say(moving("map", "base", 1, 5.0), static("map", "lidar", 2.0))
     end.hear(moving("map", "base", 1, 5.0))
     end.hear(static("map", "lidar", 2.0), static=True)
@@ -270,8 +269,7 @@ def test_what_ros_gives_back_is_no_news() -> None:
     assert end.heard[1:] == [(static("map", "lidar", 3.0, authority="/node"),)]
 
 
-def test_after_a_jump_back_of_the_clock_the_stamps_of_before_are_news() -> None:
-    end = RosEnd()
+def test_after_a_jump_back_of_the_clock_the_stamps_of_before_are_news(end: RosEnd) -> None:
     for jumps in range(2):
         end.hear(moving("map", "base", 1, 5.0))
         end.hear(static("map", "lidar", 2.0), static=True)

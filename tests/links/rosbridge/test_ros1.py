@@ -31,6 +31,8 @@ from support.both_sides import (
     check_clock,
     check_command,
     check_description_and_joints,
+    check_killed_node,
+    check_link_that_came_back,
     meet,
     node,
 )
@@ -162,31 +164,13 @@ async def test_both_ways_with_every_answer_right(tmp_path: Path) -> None:
 
 async def test_a_node_that_is_killed_is_heard_again_when_it_is_back(tmp_path: Path) -> None:
     async with ros1(tmp_path) as ros:
-        with Bus() as bus, Buffer(bus) as buffer:
-            async with RosbridgeLink(bus, ros.url) as link:
-                with ros.node(60.0):
-                    found = await buffer.lookup("base", "laser", timeout=20.0)
-                    assert found.transform.translation[0] == 0.5
-                # Killed without a word: a new one says something else.
-                with ros.node(60.0, x=0.75):
-                    await until(lambda: latched(bus)["laser"].transform.translation[0] == 0.75)
-                assert link.statistics().rejected == {}
+        with Bus() as bus:
+            await check_killed_node(RosbridgeLink(bus, ros.url), bus, ros.node)
 
 
 async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(tmp_path: Path) -> None:
     async with ros1(tmp_path) as ros:
-        with ros.node(12.0) as peer, Bus() as bus, Buffer(bus) as buffer:
-            assert (await peer.next_line())["event"] == "up"
-            program = Program(bus, buffer)
-            for _ in range(2):
-                async with RosbridgeLink(bus, ros.url), anyio.create_task_group() as tasks:
-                    tasks.start_soon(program.send)
-                    await buffer.lookup("odom", "tool", timeout=20.0)
-                    await anyio.sleep(2.0)
-                    tasks.cancel_scope.cancel()
-            facts = await peer.next_line()
-    assert facts["answered"] > 50
-    assert facts["wrong"] == 0
+        await check_link_that_came_back(lambda bus: RosbridgeLink(bus, ros.url), ros.node(12.0))
 
 
 async def test_a_link_comes_back_to_a_server_that_was_killed(tmp_path: Path) -> None:
