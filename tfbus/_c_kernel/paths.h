@@ -833,7 +833,7 @@ paths_now(const Paths *self, int64_t *now)
 static void
 paths_refuse(const Paths *self, PyObject *target, PyObject *source, PyObject *number)
 {
-    int64_t at, now = INT64_MAX;
+    int64_t at = 0, now = INT64_MAX;
     int overflow = 1;
     Chain *path = PyLong_CheckExact(number) ? paths_find(self, target, source) : NULL;
     if (path != NULL) {
