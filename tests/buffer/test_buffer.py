@@ -185,6 +185,26 @@ async def test_a_sample_between_the_wake_up_of_a_lookup_and_its_turn_counts() ->
     assert asked.answer.transform.translation == (2.0, 0.0, 0.0)
 
 
+async def test_a_wait_keeps_its_beginning_when_its_cause_changes(
+    clock: SimulatedClock, bus: Bus, buffer: Buffer
+) -> None:
+    bus.publish([moving("map", "a", 1), static("map", "b")])
+    with pytest.raises(FutureExtrapolationError):
+        buffer.lookup_nowait("map", "a", 9 * SECOND)
+    async with anyio.create_task_group() as tasks:
+        for source in ("a", "b", "c"):
+            Asked(tasks, partial(buffer.lookup, "map", source, 9 * SECOND))
+        await clock.advance(3.0)
+        bus.publish(driving("moon", "a", 1))
+        bus.publish(static("moon", "c"))
+        await settle()
+        assert [(waiting.since, type(waiting.blocked_by)) for waiting in buffer.pending()] == [
+            (0, DisconnectedError),
+            (0, DisconnectedError),
+        ]
+        tasks.cancel_scope.cancel()
+
+
 async def test_fail_after_around_a_lookup_leaves_no_waiter() -> None:
     buffer = Buffer(Bus())
     with pytest.raises(TimeoutError) as caught, anyio.fail_after(0.001):

@@ -6,8 +6,8 @@
  * `ask` gives a Parked to be awaited: a turn of the loop, then the answer, or a sleep until an insertion brings it. It is
  * parked in the line of the edge that lags most if newer samples are all that it lacks; no error says so, because Python
  * words that when somebody asks. The event loop is Python's: `begin` makes the wake-up, notes the time, sets the alarms,
- * and gives the iterator that sleeps. The result is None where the question is not plain, or the answer did not hold until
- * the task ran; then the coroutine that awaits the Parked goes on. An exception (a cancellation) is thrown into that
+ * and gives the iterator that sleeps. At the end there is no answer where the question is not plain, or the answer did not
+ * hold until the task ran; then the coroutine that awaits the Parked goes on. An exception (a cancellation) is thrown into that
  * coroutine, and it takes the Parked out of the index: there is no `throw` here.
  *
  * `insert` stores a batch, pops from the lines of its frames whoever is due, and calls `wake` with the answer already
@@ -43,29 +43,28 @@ REFERENCES(parked, 8)
 
 static PySendResult parked_step(PyObject *self, PyObject *value, PyObject **result);
 
-/* `send` of an iterator: what it yields; StopIteration with the result at its end. */
+/* `send` of an iterator: what it yields, or StopIteration at its end. */
 static PyObject *
 parked_send(PyObject *self, PyObject *value)
 {
     PyObject *result;
     const PySendResult sent = parked_step(self, value, &result);
     if (sent == PYGEN_RETURN) {
-        /* Made here, because a result that is a tuple would become the arguments. */
-        PyObject *stop = PyObject_CallFunctionObjArgs(PyExc_StopIteration, result, NULL);
-        Py_DECREF(result);
-        if (stop != NULL) {
-            PyErr_SetObject(PyExc_StopIteration, stop);
-            Py_DECREF(stop);
-        }
-        return NULL;
+        Py_CLEAR(result);
+        PyErr_SetNone(PyExc_StopIteration);
     }
-    return sent == PYGEN_NEXT ? result : NULL;
+    return result;
 }
 
+/* The same without an exception at its end. A class in Python that is derived from this one has no `am_send`. */
 static PyObject *
 parked_next(PyObject *self)
 {
-    return parked_send(self, Py_None);
+    PyObject *result;
+    if (parked_step(self, Py_None, &result) == PYGEN_RETURN) {
+        Py_CLEAR(result);
+    }
+    return result;
 }
 
 static PyObject *
@@ -454,43 +453,35 @@ feed_ask(Feed *self, PyObject *const *args, Py_ssize_t nargs)
     return OBJECT(made);
 }
 
-/* Ask, and begin to sleep if newer samples are all that is missing. The answer, or None; NULL if it sleeps, or for an
- * error. */
-static PyObject *
+/* Ask; if newer samples are all that is missing, begin to sleep: 1. 0 if it has its answer, or Python has to go on; -1 for
+ * an error. */
+static int
 parked_ask(Parked *self, const Feed *feed)
 {
     PyObject *asked[3];
     int64_t at, limit;
     if (feed->parts[PATHS] == NULL || feed->parts[BEGIN] == NULL || !is_plain(self, asked)) {
-        Py_RETURN_NONE;
+        return 0;
     }
-    PyObject *found = paths_answer((Paths *)feed->parts[PATHS], asked, 3);
-    if (found != Py_None || feed_edge(feed, self, &at, &limit) == NULL) {
-        if (PyErr_Occurred()) {
-            Py_CLEAR(found);
-        }
-        return found;
+    PyObject *old = self->answer;
+    self->answer = paths_answer((Paths *)feed->parts[PATHS], asked, 3);
+    Py_XDECREF(old);
+    if (self->answer != Py_None || feed_edge(feed, self, &at, &limit) == NULL) {
+        return PyErr_Occurred() ? -1 : 0;
     }
-    PyObject *sleeper = PyObject_CallFunctionObjArgs(feed->parts[BEGIN], OBJECT(self), self->turned ? Py_True : Py_False, NULL);
-    if (sleeper == NULL || sleeper == Py_None) {
-        Py_DECREF(found);
-        return sleeper;
-    }
-    const int parked = feed_park(feed, self);
+    PyObject *turned = self->turned ? Py_True : Py_False;
+    PyObject *sleeper = PyObject_CallFunctionObjArgs(feed->parts[BEGIN], OBJECT(self), turned, NULL);
+    const int parked = sleeper == NULL ? -1 : sleeper == Py_None ? 0 : feed_park(feed, self);
     if (parked > 0) {
-        PyObject *old = self->sleeper;
+        old = self->sleeper;
         self->sleeper = sleeper;
-        Py_XDECREF(old);
-    } else {
-        Py_DECREF(sleeper);
+        sleeper = old;
     }
-    if (parked != 0) {
-        Py_CLEAR(found);
-    }
-    return found;
+    Py_XDECREF(sleeper);
+    return parked;
 }
 
-/* One step of the wait. At its end the result is the answer, or None where Python has to go on. */
+/* One step of the wait. At its end, the answer is there if it holds. */
 static PySendResult
 parked_step(PyObject *itself, PyObject *value, PyObject **result)
 {
@@ -506,9 +497,14 @@ parked_step(PyObject *itself, PyObject *value, PyObject **result)
     }
     if (self->step == AFTER_TURN && feed != NULL) {
         self->step = NOT_AWAITED;
-        *result = parked_ask(self, feed);
-        if (self->sleeper == NULL || *result != NULL) {
-            return *result == NULL ? PYGEN_ERROR : PYGEN_RETURN;
+        const int sleeps = parked_ask(self, feed);
+        if (sleeps < 0) {
+            return PYGEN_ERROR;
+        }
+        if (!sleeps) {
+            Py_INCREF(Py_None);
+            *result = Py_None;
+            return PYGEN_RETURN;
         }
         self->step = ASLEEP;
         value = Py_None;
@@ -526,12 +522,9 @@ parked_step(PyObject *itself, PyObject *value, PyObject **result)
     }
     Py_DECREF(sleeper);
     self->step = NOT_AWAITED;
-    if (sent == PYGEN_RETURN) {
-        Paths *paths = (Paths *)feed->parts[PATHS];
-        PyObject *answer = paths != NULL && self->answer != NULL && self->version == paths->version ? self->answer : Py_None;
-        Py_INCREF(answer);
-        Py_DECREF(*result);
-        *result = answer;
+    const Paths *paths = (Paths *)feed->parts[PATHS];
+    if (paths == NULL || self->version != paths->version) {
+        Py_CLEAR(self->answer);
     }
     return sent;
 }
@@ -745,7 +738,7 @@ feed_insert(Feed *self, PyObject *batch)
 
 static PyMethodDef feed_methods[] = {
     {"ask", FAST(feed_ask), METH_FASTCALL,
-     PyDoc_STR("ask(target, source, at, turn): a lookup to be awaited; its result is None where Python has to go on.")},
+     PyDoc_STR("ask(target, source, at, turn): a lookup to be awaited, once; then it has its answer, or Python has to go on.")},
     {"insert", (PyCFunction)feed_insert, METH_O,
      PyDoc_STR("insert(batch): store a batch and wake the lookups that it has unblocked, if all is plain; else do "
                "nothing.")},

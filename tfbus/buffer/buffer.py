@@ -255,7 +255,8 @@ class Buffer:
             policy = policy_of(tolerance, max_gap, extrapolate)
             question = Question(target, source, as_at(at), as_at(source_at), fixed, max_age, policy)
             return await self._lookups.lookup(self._on_bus(question), timeout)
-        last_reset = self._share.live.last_reset
+        live = self._share.live
+        last_reset = live.last_reset
         turn = on_asyncio()
         wait = self._feed.ask(target, source, at, turn)
         if timeout is not None:
@@ -263,8 +264,9 @@ class Buffer:
         try:
             if not turn:
                 await checkpoint()
-            found: TransformStamped | None = await wait
-            if found is None or self._share.live.last_reset is not last_reset:
+            await wait
+            found: TransformStamped | None = wait.answer
+            if found is None or live.last_reset is not last_reset:
                 wait.asked = Question(target, source, as_at(at))
                 if wait.names is None:
                     # The kernel has not parked it.
