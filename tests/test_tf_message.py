@@ -285,6 +285,7 @@ def test_each_transform_is_accepted_normalised_or_refused_as_by_the_classes(
         (Part(child=b"a" * (MAX_NAME + 1)), "frame name", "map", None),
         (Part(child=b""), "frame name", "map", ""),
         (Part(numbers=(0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 1.0)), "not finite", "map", "base"),
+        (Part(numbers=(0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0)), "not a unit quaternion", "map", "base"),
     ],
 )
 def test_a_bad_transform_is_refused_with_its_facts_and_its_neighbours_are_not(

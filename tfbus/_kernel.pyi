@@ -3,7 +3,7 @@
 `Feed`, `Intake` and `Method` have no twin: without the compiled kernel the ordinary way runs; see `tfbus.which_kernel`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 Vector = tuple[float, float, float]
@@ -84,6 +84,7 @@ class Paths:
     recent: dict[str, dict[str, Chain]]
     inserted: int
     now: Any
+    qualified: Any
     version: int
     def __init__(self, lock: Any, latest: object, kind: type[Sample], /) -> None: ...
     def answer(self, target: str, source: str, at: object, /) -> Any: ...
@@ -107,11 +108,16 @@ class Judge:
 
 class Parked:
     answer: Any
+    asked: Any
     elsewhere: bool
+    limit: Any
+    names: tuple[str, ...] | None
     place: Any
-    plain: tuple[str, str, Any] | None
+    since: int
     version: int
     wake: Any
+    def __init__(self, asked: Any, since: int, wake: Any) -> None: ...
+    def __await__(self) -> Any: ...
 
 class Line:
     @property
@@ -122,6 +128,8 @@ class Line:
     def limits(self) -> list[Any]: ...
 
 class Feed:
+    begin: Any
+    kind: type[Parked]
     def __init__(
         self,
         paths: Paths,
@@ -131,9 +139,10 @@ class Feed:
         parked: Mapping[Any, None],
         limits: list[Any],
         watches: Mapping[str, Any],
-        forget: Any,
+        index: Any,
         /,
     ) -> None: ...
+    def ask(self, target: str, source: str, at: Any, turn: bool, /) -> Any: ...
     def insert(self, batch: tuple[Sample, ...], /) -> bool: ...
 
 class Intake:
@@ -141,7 +150,15 @@ class Intake:
     open: bool
     samples: int
     thread: int
-    def __init__(self, judge: Judge, kind: type[Sample], listeners: tuple[Any, ...], /) -> None: ...
+    def __init__(
+        self,
+        judge: Judge,
+        kind: type[Sample],
+        tell: Callable[[Any], object],
+        listeners: tuple[Any, ...],
+        busy: tuple[Any, ...],
+        /,
+    ) -> None: ...
     def take(self, samples: object, invalid: object, /) -> bool | None: ...
 
 class Method:

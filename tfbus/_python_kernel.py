@@ -162,29 +162,42 @@ Place = tuple[int, int, Any]
 class Parked:
     """The part of a parked lookup that a wake-up needs.
 
-    Attributes
+    Parameters
     ----------
-    plain : tuple or None
-        Target, source and stamp of its question, if the kernel may answer it.
+    asked : tuple
+        Target, source and stamp, and options. If all options are None, it is plain: the kernel may answer it.
+    since : int
+        The stamp at which the lookup began to wait, in ns.
     wake : callable
         Called once, without arguments, after it was taken out of its line.
+
+    Attributes
+    ----------
+    names : tuple of str or None
+        The frames that block it.
     place : tuple or None
-        Its place in a line, if it has one.
+        Its place in the line of the frame that blocks it, if it has one.
+    limit : tuple or None
+        Its place among the first limits of all lookups, if it has one.
     answer : TransformStamped or None
         The plain answer that the insertion found when it woke the lookup, if there was one.
     version : int
         The version of the paths that gave this answer.
     elsewhere : bool
-        Whether its wake-up has to remove it from more than its line and the dict of all parked lookups.
+        Whether its wake-up has to remove it from more than its line, these limits and the dict of all parked lookups.
     """
 
-    __slots__ = ("answer", "elsewhere", "place", "plain", "version", "wake")
-    answer: Any
-    elsewhere: bool
-    place: Place | None
-    plain: tuple[str, str, int | Latest | None] | None
-    version: int
-    wake: Callable[[], object]
+    names: tuple[str, ...] | None = None
+    place: Place | None = None
+    limit: Place | None = None
+    answer: Any = None
+    version: int = 0
+    elsewhere: bool = False
+
+    def __init__(self, asked: Any, since: int, wake: Callable[[], object]) -> None:
+        self.asked = asked
+        self.since = since
+        self.wake = wake
 
 
 class Line:
@@ -726,10 +739,12 @@ class Paths:
     version : int
         A number that differs after each change.
     now : callable or None
-        The clock that ages are counted from, which gives a stamp in ns. Only the compiled kernel asks it.
+        The clock that ages are counted from, which gives a stamp in ns.
+    qualified : type or None
+        The class of an answer with a policy. Only the compiled kernel gives such answers, and answers by age.
     """
 
-    __slots__ = ("_changes", "_kind", "_latest", "_lock", "inserted", "now", "recent")
+    __slots__ = ("_changes", "_kind", "_latest", "_lock", "inserted", "now", "qualified", "recent")
 
     def __init__(self, lock: AbstractContextManager[Any], latest: Latest, kind: Any) -> None:
         self._lock = lock
@@ -738,6 +753,7 @@ class Paths:
         self.recent: dict[str, dict[str, Chain]] = {}
         self.inserted = 0
         self.now: Any = None
+        self.qualified: Any = None
         self._changes = 0
 
     @property

@@ -58,10 +58,9 @@ def series_of(chain: str) -> list[Series]:
     return series
 
 
-def transform_tree_of(chain: str) -> Any:
+def transform_tree_of(series: list[Series]) -> Any:
     """The tree of transform-tree, interpolating as tf2 does."""
     tf_tree = pytest.importorskip("tf_tree")
-    series = series_of(chain)
     tree = tf_tree.build([(each.parent, each.child) for each in series], capacity=1024, interp="lerpslerp")
     for parent, child, stamps, translations, wxyz in series:
         with tree.publisher(child, parent) as publisher:
@@ -71,7 +70,7 @@ def transform_tree_of(chain: str) -> Any:
 
 def transform_tree(chain: str) -> Callable[[Stamps], Floats]:
     """The answers of transform-tree at many stamps."""
-    matrices: Callable[[Stamps], Floats] = transform_tree_of(chain).plan(BASE, last_of(chain)).at
+    matrices: Callable[[Stamps], Floats] = transform_tree_of(series_of(chain)).plan(BASE, last_of(chain)).at
     return matrices
 
 
@@ -87,7 +86,7 @@ def pytransform3d(chain: str) -> Callable[[Stamps], Floats]:
 
 @CHAINS
 def test_one_lookup_by_name(table: Table, chain: str) -> None:
-    peer = transform_tree_of(chain)
+    peer = transform_tree_of(series_of(chain))
     source, stamps = last_of(chain), cases.questions("lookup")
 
     def with_each(ask: Callable[[str, str, int], Any]) -> Turn:
@@ -100,6 +99,25 @@ def test_one_lookup_by_name(table: Table, chain: str) -> None:
         return with_each(tree.lookup)
 
     table.measure(f"lookup by name, {edges(chain)}", on, "transform-tree", with_each(peer.lookup), "<= 0.6", "ns")
+
+
+@pytest.mark.parametrize("chain", ["m" * 10, "m" * 30], ids=edges)
+def test_the_latest_of_edges_with_equal_stamps(table: Table, chain: str) -> None:
+    """The plan of transform-tree takes the newest sample of each edge, so here both give the same answer."""
+    stamps = START + PERIOD * np.arange(1_000)
+    series = [each._replace(stamps=stamps) for each in series_of(chain)]
+    plan, source = transform_tree_of(series).plan(BASE, last_of(chain)), last_of(chain)
+
+    def on(package: Any) -> Turn:
+        tree = package.TransformTree(2 * cases.KEEP)
+        for parent, child, own, translations, wxyz in series:
+            tree.insert_columns(parent, child, own, translations, np.roll(wxyz, -1, axis=1))
+        found = tree.lookup(BASE, source).transform.matrix()
+        np.testing.assert_allclose(found, plan.latest(), rtol=0, atol=1e-12)
+        return timed(lambda: [tree.lookup(BASE, source) for _ in range(MANY)], MANY)
+
+    peer = timed(lambda: [plan.latest() for _ in range(MANY)], MANY)
+    table.measure(f"lookup LATEST, equal stamps, {edges(chain)}", on, "transform-tree", peer, "<= 1.0", "ns")
 
 
 @pytest.mark.parametrize("order", ["sorted", "random"])

@@ -174,6 +174,17 @@ async def test_a_sample_in_the_turn_in_which_the_timeout_expires_still_answers(
     assert buffer.pending() == ()
 
 
+async def test_a_sample_between_the_wake_up_of_a_lookup_and_its_turn_counts() -> None:
+    _, bus, buffer = make()
+    bus.publish([moving("map", "a", 0), moving("a", "b", 0)])
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
+        await settle()
+        for sample in (moving("map", "a", 5, 1.0), moving("map", "a", 5, 2.0), moving("a", "b", 5)):
+            bus.publish(sample)
+    assert asked.answer.transform.translation == (2.0, 0.0, 0.0)
+
+
 async def test_fail_after_around_a_lookup_leaves_no_waiter() -> None:
     buffer = Buffer(Bus())
     with pytest.raises(TimeoutError) as caught, anyio.fail_after(0.001):

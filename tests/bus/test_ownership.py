@@ -98,6 +98,14 @@ def test_of_two_edges_of_others_the_one_that_came_last_is_removed(bus: Bus, last
     assert {event.frame for event in edges_of(bus)} == {"base", "a", "map"} - {last}
 
 
+def test_of_one_batch_the_edge_of_the_other_is_left_out() -> None:
+    bus = Bus(SimulatedClock())
+    batch = [moving("base", "map", 1, authority="stranger"), moving("map", "base", 1, authority="owner")]
+    with bus.reserve("base", "owner"):
+        bus.publish(batch, invalid="drop")
+    assert [event.frame for event in edges_of(bus)] == ["base"]
+
+
 def test_a_batch_that_is_refused_for_another_reason_removes_nothing() -> None:
     bus = Bus(SimulatedClock())
     bus.publish([moving("base", "map", 1, authority="stranger"), moving("p", "q", 1)])

@@ -279,12 +279,12 @@ def test_the_help_of_all_and_the_version_load_no_optional_package_and_no_numpy(o
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_silently_whenever_it_comes(number: signal.Signals) -> None:
     statuses = set()
-    for step in range(16):
+    for step in range(8):
         with Program(sys.executable, "-X", "importtime", TFBUS, "tree", "--domain", new_domain()) as tree:
             # Python itself shows a traceback of its own start: until a module is loaded by the command.
             tree.errors.expect(r"\| +tfbus\.cli$")
             tree.errors.expect("import time")
-            time.sleep(0.05 * step)
+            time.sleep(0.1 * step)
             statuses.add(tree.end(number))
         said = [line for line in tree.errors.text.splitlines() if not line.startswith("import time:")]
         assert not said or (len(said) == 1 and said[0].startswith("waiting for transforms"))

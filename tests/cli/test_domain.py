@@ -356,8 +356,7 @@ def test_what_is_no_place_of_ros_is_a_usage_error(place: str, why: str) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("kind", ["domain", "ros"])
+@pytest.mark.parametrize(("kind", "backend"), [("domain", "asyncio"), ("ros", "trio")])
 def test_programs_of_all_commands_meet_on_a_domain_and_on_ros(tmp_path: Path, kind: str, backend: str) -> None:
     for extra in ("cyclonedds", "urdf_parser_py"):
         pytest.importorskip(extra)

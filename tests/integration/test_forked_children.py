@@ -117,6 +117,7 @@ for kind in {list(ENTERED.values())}:
     assert lines == []
 
 
+@pytest.mark.thorough
 def test_a_child_cannot_use_the_threads_and_links_of_its_parent_nor_enter_one_of_zenoh() -> None:
     lines = said(f"""
 async def enter(link):
@@ -147,6 +148,7 @@ anyio.run(main)
     ]
 
 
+@pytest.mark.thorough
 def test_a_child_of_a_program_with_a_local_link_meets_it_and_the_parent_has_it_still() -> None:
     lines = said("""
 async def meet(link):

@@ -392,12 +392,11 @@ def test_no_command_prints_a_name_of_a_file_as_it_is(
         pytest.importorskip("matplotlib", reason="plots need matplotlib")
     monkeypatch.setenv("COLUMNS", columns)
     done = tfbus(*filled(arguments, recording, NAMES))
-    plain = tfbus(*filled(arguments, plain_recording, PLAIN))
     if columns:
         # A name is long, and its line is broken.
         lines_of(done.stdout + done.stderr)
     else:
-        check_output(done, plain)
+        check_output(done, tfbus(*filled(arguments, plain_recording, PLAIN)))
 
 
 @pytest.mark.parametrize("arguments", ON_DOMAIN.values(), ids=ON_DOMAIN)

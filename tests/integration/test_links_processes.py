@@ -16,7 +16,7 @@ from start_together import measure
 from support.processes import PATIENCE, Crowd, PeerProcess, Place, crowd
 
 pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
-thorough = pytest.mark.thorough
+pytestmark = pytest.mark.thorough
 
 BACKENDS = ("asyncio", "trio", "asyncio+uvloop")
 SECONDS = 4
@@ -32,7 +32,7 @@ def processes() -> Iterator[Crowd]:
         yield together
 
 
-@pytest.fixture(params=["local", pytest.param("router", marks=thorough)])
+@pytest.fixture(params=["local", "router"])
 def place(request: pytest.FixtureRequest) -> Place:
     return Place(request.param)
 
@@ -68,7 +68,6 @@ def send_in_turn(processes: list[PeerProcess]) -> None:
             assert (link["lost"], link["rejected"], link["queue"]["dropped"]) == (0, {}, 0)
 
 
-@thorough
 def test_three_processes_have_every_sample_once(processes: Crowd, place: Place) -> None:
     links = [place.first(), place.other(), place.other()]
     members = [processes.add(link, backend=backend) for link, backend in zip(links, BACKENDS, strict=True)]
@@ -82,7 +81,6 @@ def test_three_processes_have_every_sample_once(processes: Crowd, place: Place) 
         assert link["sent_samples"] < link["received_samples"]
 
 
-@thorough
 def test_a_ring_of_three_domains_brings_every_sample_once(processes: Crowd) -> None:
     places = [Place("local"), Place("router"), Place("local")]
     members = [
@@ -95,7 +93,7 @@ def test_a_ring_of_three_domains_brings_every_sample_once(processes: Crowd) -> N
     send_in_turn(members)
 
 
-@pytest.mark.parametrize("drop_lost", [False, pytest.param(True, marks=thorough)])
+@pytest.mark.parametrize("drop_lost", [False, True])
 def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_and_for_late_joiners(
     drop_lost: bool, processes: Crowd, place: Place
 ) -> None:
@@ -132,7 +130,6 @@ def test_what_a_killed_process_has_said_is_the_same_for_those_who_heard_it_and_f
     assert "lidar" not in latest.ask("facts")["x"]
 
 
-@thorough
 def test_a_process_that_is_held_up_for_a_part_of_its_lease_is_not_lost(processes: Crowd) -> None:
     place = Place("router")
     listener = processes.add(place.first(lease=4.0, drop_lost=True))
@@ -150,7 +147,6 @@ def test_a_process_that_is_held_up_for_a_part_of_its_lease_is_not_lost(processes
     assert not listener.said(event="PeerLost")
 
 
-@thorough
 def test_a_slow_and_a_frozen_process_delay_no_other(processes: Crowd, place: Place) -> None:
     # The lease outlasts the test, so no peer is spared by being lost.
     broadcaster = processes.add(place.first(lease=60.0))
@@ -178,7 +174,6 @@ def test_a_slow_and_a_frozen_process_delay_no_other(processes: Crowd, place: Pla
     frozen.ask("until", static=["lidar"])
 
 
-@thorough
 def test_a_lookup_in_one_process_is_answered_by_another(processes: Crowd, place: Place) -> None:
     asking = processes.add(place.first(), backend="trio")
     answering = processes.add(place.other())
@@ -252,14 +247,12 @@ def program_beside(processes: Crowd, place: Place, text: str, **names: str) -> I
     broadcaster.wait(event="PeerLost")
 
 
-@thorough
 @pytest.mark.parametrize("end", CRASHES.values(), ids=CRASHES.keys())
 def test_a_link_that_was_never_ended_does_not_keep_the_program(end: str, processes: Crowd, place: Place) -> None:
     with program_beside(processes, place, BEGIN + CRASH + end) as program:
         assert (*program.communicate(timeout=PATIENCE), program.returncode) == ("crash\n", "", 0)
 
 
-@thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 def test_ctrl_c_ends_a_program_with_a_link(backend: str, processes: Crowd, place: Place) -> None:
     with program_beside(processes, place, BEGIN + LISTEN, BACKEND=backend) as program:
@@ -270,6 +263,5 @@ def test_ctrl_c_ends_a_program_with_a_link(backend: str, processes: Crowd, place
     assert (output.splitlines()[-1], errors, program.returncode) == ("interrupted", "", 0)
 
 
-@thorough
 def test_processes_that_start_together_all_have_every_static_frame(place: Place) -> None:
     assert max(facts.met for facts in measure(8, place)) < PATIENCE

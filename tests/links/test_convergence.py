@@ -7,14 +7,14 @@ import os
 from collections.abc import Sequence
 
 import pytest
-from support.domains import Network, Process, World, agree, shown
+from support.domains import Network, Process, Stranger, World, agree, shown
 from support.samples import moving, static
 
 from tfbus.links.message import Kind
 
 NAMES = [f"static{k}" for k in range(5)]
 LIMIT = 10.0
-SEEDS = int(os.environ.get("CONVERGENCE_SEEDS", "100"))
+SEEDS = int(os.environ.get("CONVERGENCE_SEEDS", "40"))
 
 
 def few_or_many(few: int, many: int) -> pytest.MarkDecorator:
@@ -110,7 +110,7 @@ def check_truth(world: World) -> None:
 def until_they_agree(world: World, groups: list[list[Process]]) -> None:
     end = world.now + LIMIT
     while not all(agree(group) for group in groups):
-        assert world.now < end, [[shown(process) for process in group] for group in groups]
+        assert world.now < end, (world.seed, [[shown(process) for process in group] for group in groups])
         world.run(0.5)
 
 
@@ -290,6 +290,20 @@ def test_what_a_killed_process_has_said_stays_for_all_and_for_late_joiners_or_fo
     later = world.process(network)
     world.run(5.0)
     assert [set(process.frames) for process in (keep, late, away, later)] == [{"lidar"}] * 4
+
+
+@pytest.mark.parametrize("drop_lost", [False, True])
+def test_a_late_sample_of_another_bus_brings_no_frame_back_that_was_withdrawn(drop_lost: bool) -> None:
+    world = World()
+    network = Network(world)
+    process = world.process(network, drop_lost=drop_lost)
+    earlier, newest = Stranger(network), Stranger(network)
+    newest.say(newest.batch(moving("map", "goal", 2), number=2))
+    network.remove(newest)
+    world.run(0.1)
+    earlier.say(earlier.batch(moving("map", "goal", 1), number=1))
+    assert shown(process) == ({} if drop_lost else {"goal": 2})
+    assert [sample.stamp for sample in process.seen] == ([2] if drop_lost else [2, 1])
 
 
 def test_copies_that_agree_cost_signs_only_and_ever_fewer() -> None:

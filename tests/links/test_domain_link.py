@@ -80,7 +80,6 @@ async def raw(network: MemoryNetwork) -> tuple[MemoryWire, list[Any]]:
     return wire, items
 
 
-@pytest.mark.every_loop
 async def test_what_is_said_in_one_turn_goes_out_in_one_message_and_is_heard_batch_by_batch() -> None:
     network = MemoryNetwork()
     with Bus() as here, Bus() as there:
@@ -251,6 +250,28 @@ async def test_a_link_that_is_used_in_another_event_loop_says_so(anyio_backend_n
             with pytest.raises(RuntimeError, match="entered once"):
                 await link.__aenter__()
         assert repr(link) == "<DomainLink 'tf': not joined>"
+
+
+def test_all_links_of_a_bus_are_entered_in_one_event_loop() -> None:
+    async def use(entered: asyncio.Event, refused: asyncio.Event) -> None:
+        async with DomainLink(bus, "tf", network.wire()):
+            entered.set()
+            await refused.wait()
+            async with link:
+                pass
+
+    network, first, second = MemoryNetwork(), asyncio.new_event_loop(), asyncio.new_event_loop()
+    entered, refused = asyncio.Event(), asyncio.Event()
+    with Bus() as bus:
+        link = DomainLink(bus, "another", network.wire())
+        task = first.create_task(use(entered, refused))
+        first.run_until_complete(entered.wait())
+        with pytest.raises(RuntimeError, match="'tf': 0 peers> was entered in another event loop"):
+            second.run_until_complete(link.__aenter__())
+        refused.set()
+        first.run_until_complete(task)
+    first.close()
+    second.close()
 
 
 def test_after_a_crash_of_the_event_loop_what_comes_does_no_harm_and_what_is_published_says_so(

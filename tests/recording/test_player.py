@@ -153,7 +153,7 @@ async def watch_positions(bus: Bus, buffer: Buffer, seen: list[float]) -> None:
         seen.append(found.transform.translation[0])
 
 
-@pytest.mark.parametrize("runs", [2, pytest.param(20, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("runs", [2, pytest.param(6, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 def test_timed_tasks_see_the_same_in_each_run(tmp_path: Path, backend: str, runs: int) -> None:
     # Several blocks, so that the reading thread is busy meanwhile.

@@ -537,7 +537,7 @@ class Game:
 
 # The tests
 
-SCHEDULES = int(os.environ.get("ORACLE_SCHEDULES", "1000"))
+SCHEDULES = int(os.environ.get("ORACLE_SCHEDULES", "300"))
 """On each loop, in the thorough suite."""
 
 PARTS = 4

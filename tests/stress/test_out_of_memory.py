@@ -232,7 +232,7 @@ def test_no_waiter_is_lost_whichever_allocation_fails(name: str, waiting: int) -
         # The last one is beyond all limits.
         for stamp in (20, 21, 10**11):
             scene.live.insert(chain(stamp))
-        assert scene.live.waiting.pending() == ()
+        assert scene.live.waiting.parked == {}
         assert (scene.live.waiting.by_frame, scene.live.waiting.limits) == ({}, [])
         if name != "cancel":
             assert not any(scene.asleep)

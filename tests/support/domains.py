@@ -19,7 +19,7 @@ from tfbus.links.domain import DomainEnd
 from tfbus.links.endpoint import Endpoint, ForeignEnd
 from tfbus.links.link import ReceiveQueue
 from tfbus.links.message import NOTHING, Kind, Outgoing, kind_of, write_message
-from tfbus.links.relay import OutgoingBatch, RemovedFrame
+from tfbus.links.relay import OutgoingBatch, RemovedFrame, relay_of
 from tfbus.links.replica import Claim
 from tfbus.links.seams import Hearing, Joined, Left, Receive, Received, WireItem
 from tfbus.tf_message import MalformedMessageError
@@ -39,6 +39,7 @@ class World:
     """The time, the networks and the processes."""
 
     def __init__(self, seed: int = 0) -> None:
+        self.seed = seed
         self.random = random.Random(seed)
         # The library draws pauses.
         random.seed(seed)
@@ -326,6 +327,8 @@ class Process:
     ) -> None:
         self.world = world
         self.bus = Bus(SimulatedClock(int(world.now * SECOND)), max_ahead=None)
+        # The relay draws it elsewhere, and a run has to be given by its seed.
+        relay_of(self.bus).origin = world.random.randbytes(16)
         self.networks = networks
         self.name: str = options.pop("name", f"{next(world.names)}")
         self.drop_lost = drop_lost

@@ -149,6 +149,7 @@ def seconds(value: float) -> int:
         (1.5, {"max_gap": 4.0}, 1.5 + 15.0 + 0.5, 0.0, 4.0),
         (3.0, {"max_gap": 4.0}, 3.0 + 30.0 + 0.5, 0.0, 4.0),
         (3.0, {"max_gap": 3.9, "tolerance": 1.0}, 2.0 + 40.0 + 0.5, 1.0, 0.0),
+        (2.0, {"max_gap": 3.9, "tolerance": 2.0}, 2.0 + 0.0 + 0.5, 2.0, 0.0),
         (4.5, {"tolerance": 0.5}, 4.5 + 40.0 + 0.5, 0.5, 4.0),
         (5.0, {"extrapolate": Hold(1.0)}, 5.0 + 40.0 + 0.5, 1.0, 4.0),
         (6.5, {"extrapolate": Hold(2.5)}, 6.0 + 40.0 + 0.5, 2.5, 0.0),
@@ -159,7 +160,8 @@ def seconds(value: float) -> int:
 def test_the_answer_has_its_extrapolation_and_gap(
     tree: TransformTree, at: float, policy: dict[str, Any], x: float, extrapolated_by: float, gap: float
 ) -> None:
-    for target, source, sign in (("odom", "tool", 1.0), ("tool", "odom", -1.0)):
+    # Twice, because the kernel answers from a path that is known.
+    for target, source, sign in (("odom", "tool", 1.0), ("tool", "odom", -1.0)) * 2:
         found = tree.lookup(target, source, seconds(at), **policy)
         assert found.transform.translation == pytest.approx((sign * x, 0.0, 0.0))
         assert (found.parent, found.child, found.stamp) == (target, source, seconds(at))
@@ -216,10 +218,11 @@ def test_latest_in_the_gap_of_another_edge_waits_for_the_end_of_the_gap(tree: Tr
 def test_latest_goes_as_far_as_the_lagging_edge_may_be_held_but_not_beyond_the_newest(
     tree: TransformTree, policy: dict[str, Any], stamp: float, x: float, extrapolated_by: float
 ) -> None:
-    found = tree.lookup("odom", "arm", **policy)
-    assert found.stamp == seconds(stamp)
-    assert found.transform.translation[0] == pytest.approx(x)
-    assert found.extrapolated_by == seconds(extrapolated_by)
+    for _ in range(2):
+        found = tree.lookup("odom", "arm", **policy)
+        assert found.stamp == seconds(stamp)
+        assert found.transform.translation[0] == pytest.approx(x)
+        assert found.extrapolated_by == seconds(extrapolated_by)
 
 
 def test_time_travel_has_the_greater_extrapolation_and_gap_of_both_legs(tree: TransformTree) -> None:

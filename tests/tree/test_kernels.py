@@ -146,8 +146,7 @@ def test_no_change_of_a_history_changes_its_columns_that_somebody_holds(kernel: 
 
 
 @on_both
-@pytest.mark.parametrize("keep", [19_999, None])
-@pytest.mark.parametrize("disturbed", [False, True])
+@pytest.mark.parametrize(("keep", "disturbed"), [(19_999, False), (19_999, True), (None, True)])
 def test_a_long_history_has_all_samples_of_its_window_at_all_times(
     kernel: ModuleType, keep: int | None, disturbed: bool
 ) -> None:

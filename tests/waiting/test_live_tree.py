@@ -37,7 +37,7 @@ def test_a_sample_wakes_exactly_the_waiters_whose_stamp_it_covers() -> None:
     assert woken == []
     live.insert((moving("map", "a", 4),))
     assert woken == ["a", "a"]
-    assert [pending.question.at for pending in live.waiting.pending()] == [5, 3]
+    assert [waiter.question.at for waiter in live.waiting.parked] == [5, 3]
 
 
 def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
@@ -75,8 +75,8 @@ class CountedFrames(dict[str, FrameHistory]):
 @pytest.mark.parametrize("event", ["another parent", "removal"])
 def test_a_change_of_parents_costs_no_walk_through_all_frames(event: str) -> None:
     live = live_tree(None)
-    live.insert(tuple(moving("map", f"f{number}", 1) for number in range(2_000)))
-    live.insert(tuple(moving(f"f{number}", f"g{number}", 1) for number in range(2_000)))
+    live.insert(tuple(moving("map", f"f{number}", 1) for number in range(300)))
+    live.insert(tuple(moving(f"f{number}", f"g{number}", 1) for number in range(300)))
     woken: list[str] = []
     for source in ("g7", "g8"):
         park(live, "map", source, 9, woken)
@@ -168,4 +168,4 @@ def test_an_interrupt_of_one_wake_up_keeps_no_other_from_being_woken() -> None:
     with pytest.raises(KeyboardInterrupt):
         live.insert((moving("map", "a", 5),))
     assert woken == ["a"]
-    assert live.waiting.pending() == ()
+    assert live.waiting.parked == {}

@@ -100,7 +100,8 @@ def test_new_limits_of_a_waiter_replace_the_old_ones(index: WaitingIndex) -> Non
 
 def test_the_names_are_those_of_all_questions_of_parked_waiters(index: WaitingIndex) -> None:
     plain = waiter()
-    wide = Waiter(Question("map", "laser", 5, 5, "odom"), 0, list, others=(Question("base", "laser", 7),))
+    wide = Waiter(Question("map", "laser", 5, 5, "odom"), 0, list)
+    wide.others = (Question("base", "laser", 7),)
     index.park(plain, unknown("tool"))
     index.park(wide, unknown("laser"))
     assert set(index.names) == {"map", "tool", "laser", "odom", "base"}

@@ -8,16 +8,99 @@ scheduled earlier has run, and nothing is left to run.
 """
 
 import logging
+import sys
 import threading
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from asyncio import get_running_loop
+from collections.abc import Awaitable, Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import Context, copy_context
+from functools import partial
 from time import monotonic
+from types import SimpleNamespace, coroutine
 from typing import Any, cast
 
 import anyio
 import anyio.lowlevel
 import anyio.to_thread
+
+# trio writes its name here while it runs a task, also inside a task of asyncio, as in a cell of a notebook. It needs
+# sniffio, which anyio has imported if it is installed.
+_here: Any = getattr(sys.modules.get("sniffio"), "thread_local", SimpleNamespace(name=None))
+
+
+@coroutine
+def _turn() -> Generator[None, None, None]:
+    yield
+
+
+def on_asyncio() -> bool:
+    """Whether the running task is one of asyncio, which takes a bare yield of None as a checkpoint."""
+    return _here.name is None
+
+
+def checkpoint() -> Awaitable[None]:
+    """`anyio.lowlevel.checkpoint`, without the way through anyio."""
+    return _turn() if _here.name is None else _lowlevel().checkpoint()
+
+
+def running_loop() -> Any:
+    """The running event loop: the loop object of asyncio, or the token of trio."""
+    return get_running_loop() if _here.name is None else _lowlevel().current_trio_token()
+
+
+def _lowlevel() -> Any:
+    return sys.modules["trio.lowlevel"]
+
+
+@coroutine
+def asleep(sleep: Generator[Any, None, None]) -> Generator[Any, None, None]:
+    """Sleep as `wake_up` says."""
+    yield from sleep
+
+
+def wake_up(loop: Any) -> tuple[Generator[Any, None, None], Callable[[], object]]:
+    """The sleep of one task on the running loop, to be iterated once by that task, and the function that ends it.
+
+    If it was ended before the task awaits it, there is no checkpoint. The function may raise an `Exception` if the wait
+    has ended, or the event loop is closed.
+    """
+    if _here.name is None:
+        # No function of Python is then on the way from a publish to the event loop.
+        future = loop.create_future()
+        return future.__await__(), partial(future.set_result, None)
+    woken = _TrioWakeUp()
+    return woken.sleep(), woken.end
+
+
+class _TrioWakeUp:
+    """A wait of one task on trio."""
+
+    __slots__ = ("_ended", "_task")
+
+    def __init__(self) -> None:
+        self._task: Any = None
+        self._ended = False
+
+    def end(self) -> None:
+        """End the wait, if it has not ended."""
+        if not self._ended:
+            self._ended = True
+            task, self._task = self._task, None
+            if task is not None:
+                _lowlevel().reschedule(task)
+
+    def sleep(self) -> Generator[Any, None, None]:
+        """Sleep until `end` is called."""
+        if not self._ended:
+            lowlevel = _lowlevel()
+            self._task = lowlevel.current_task()
+            yield from lowlevel.wait_task_rescheduled(self._abort).__await__()
+
+    def _abort(self, _raise_cancel: object) -> Any:
+        """End the wait, because trio has cancelled it."""
+        self._task = None
+        self._ended = True
+        return _lowlevel().Abort.SUCCEEDED
 
 
 class LoopWaker:

@@ -41,7 +41,9 @@ enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quat
 static PyTypeObject *ColumnsType, *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
 static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType, *MethodType;
 static PyObject *empty_string, *raise_string, *drop_string, *at_string, *paths_string, *memory_string;
-static PyObject *source_at_string, *fixed_string, *max_age_string, *not_before_string, *not_after_string;
+static PyObject *child_string, *source_at_string, *fixed_string, *max_age_string, *not_before_string;
+static PyObject *not_after_string, *tolerance_string, *max_gap_string, *extrapolate_string, *nanoseconds_string;
+static PyObject *policy_use_string, *error_string, *passed_string;
 static PyObject *bound_method; /* types.MethodType */
 static PyObject *array_type;   /* numpy.ndarray; NULL until somebody asks with an array */
 
@@ -256,8 +258,8 @@ set_string_of(PyObject *self, PyObject *value, void *closure)
     return 0;
 }
 
-/* The row of a @ b: tfbus.rows.compose. `out` may be `b`. */
-static void
+/* The row of a @ b: tfbus.rows.compose. `out` may be `b`. Inlined, so that a product of many rows stays in registers. */
+static inline Py_ALWAYS_INLINE void
 compose(const double *a, const double *b, double *out)
 {
     const double ai = a[3], aj = a[4], ak = a[5], aw = a[6];

@@ -68,8 +68,11 @@ module_exec(PyObject *module)
         PyObject **place;
     } strings[] = {{"", &empty_string}, {"raise", &raise_string}, {"drop", &drop_string},
                    {"at", &at_string}, {"_paths", &paths_string}, {"_memory", &memory_string},
+                   {"child", &child_string}, {"passed", &passed_string},
                    {"source_at", &source_at_string}, {"fixed", &fixed_string}, {"max_age", &max_age_string},
-                   {"not_before", &not_before_string}, {"not_after", &not_after_string}};
+                   {"not_before", &not_before_string}, {"not_after", &not_after_string}, {"tolerance", &tolerance_string}, {"max_gap", &max_gap_string},
+                   {"extrapolate", &extrapolate_string}, {"_nanoseconds", &nanoseconds_string},
+                   {"_policy_use", &policy_use_string}, {"extrapolation_error", &error_string}};
     for (size_t i = 0; i < sizeof strings / sizeof *strings; i++) {
         if (*strings[i].place == NULL && (*strings[i].place = PyUnicode_InternFromString(strings[i].text)) == NULL) {
             return -1;

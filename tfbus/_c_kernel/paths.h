@@ -96,45 +96,68 @@ chain_init(Chain *self, PyObject *args, PyObject *kwargs)
 static const unsigned char each[LANES] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 11, 12, 13, 14, 15,
                                           16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
 
-/* Source in target at a stamp. */
+/* The product of `count` rows, the last one first, times `product`; of the rows alone if `begins`. */
+static void
+climb(const double *const *rows, Py_ssize_t count, int begins, double *product)
+{
+    double row[WIDTH];
+    memcpy(row, begins ? rows[0] : product, ROW_SIZE);
+    for (Py_ssize_t i = begins; i < count; i++) {
+        compose(rows[i], row, row);
+    }
+    memcpy(product, row, ROW_SIZE);
+}
+
+/* Source in target at a stamp; as far as a policy allows, if it is not NULL. */
 static Status
-chain_at(const Chain *self, int64_t at, double *out)
+chain_at(const Chain *self, int64_t at, Policy *policy, double *out)
 {
     const Py_ssize_t steps = self->up + self->down;
     double below[WIDTH];
     memcpy(out, identity, ROW_SIZE);
     for (Py_ssize_t first = 0; first < steps; first += LANES) {
         const Py_ssize_t count = steps - first < LANES ? steps - first : LANES;
+        const double *rows[LANES];
         Segment segments[LANES];
-        Turn turns[LANES];
-        int64_t stamps[LANES];
-        double rows[LANES][WIDTH];
+        unsigned char which[LANES];
+        Py_ssize_t between = 0;
         for (Py_ssize_t i = 0; i < count; i++) {
             const Step *step = &self->steps[first + i];
-            stamps[i] = at;
+            rows[i] = step->row;
             if (step->edge == NULL) {
-                segments[i].a = NULL;
-                segments[i].b = step->row;
                 continue;
             }
             if (step->edge->mixed) {
                 return NOT_PLAIN;
             }
             const Samples samples = samples_of(step->edge);
-            const Status status = find_segment(&samples, at, &segments[i]);
+            const Status status = policy == NULL ? find_segment(&samples, at, &segments[between])
+                                                 : find_segment_within(&samples, at, policy, &segments[between]);
             if (status != ANSWERED) {
                 return status;
             }
-        }
-        find_turns(segments, turns, count);
-        blend(segments, turns, each, stamps, count, rows[0], WIDTH, 1);
-        for (Py_ssize_t i = 0; i < count; i++) {
-            double *side = first + i < self->up ? out : below;
-            if (first + i == 0 || first + i == self->up) {
-                memcpy(side, rows[i], ROW_SIZE);
-            } else {
-                compose(rows[i], side, side);
+            rows[i] = segments[between].b;
+            if (segments[between].a != NULL) {
+                which[between++] = (unsigned char)i;
             }
+        }
+        double blended[LANES][WIDTH];
+        if (between > 0) {
+            Turn turns[LANES];
+            int64_t stamps[LANES];
+            find_turns(segments, turns, between);
+            for (Py_ssize_t i = 0; i < between; i++) {
+                stamps[i] = at;
+                rows[which[i]] = blended[i];
+            }
+            blend(segments, turns, each, stamps, between, blended[0], WIDTH, 1);
+        }
+        const Py_ssize_t up = first + count <= self->up ? count : first < self->up ? self->up - first : 0;
+        if (up > 0) {
+            climb(rows, up, first == 0, out);
+        }
+        if (up < count) {
+            climb(rows + up, count - up, first + up == self->up, below);
         }
     }
     if (self->down > 0) {
@@ -190,6 +213,20 @@ chain_newest(const Chain *self, int64_t *stamp)
     return 1;
 }
 
+/* The newest stamp of any moving edge, as far as the edge that has reached `common` may be held. */
+static int64_t
+chain_newest_within(const Chain *self, int64_t common, uint64_t hold)
+{
+    int64_t newest = common;
+    for (Py_ssize_t i = 0; i < self->up + self->down; i++) {
+        const History *edge = self->steps[i].edge;
+        if (edge != NULL && block_stamps(edge->block)[edge->end - 1] > newest) {
+            newest = block_stamps(edge->block)[edge->end - 1];
+        }
+    }
+    return (uint64_t)newest - (uint64_t)common <= hold ? newest : common + (int64_t)hold;
+}
+
 /* Whether the samples of every moving edge cover a stamp. */
 static int
 chain_covers(const Chain *self, int64_t at)
@@ -214,36 +251,42 @@ chain_covers_method(Chain *self, PyObject *number)
     return read_stamp(number, &at) < 0 ? NULL : PyBool_FromLong(chain_covers(self, at));
 }
 
-/* deciding(at): the edge whose error counts at a stamp that is not covered: the first that has dropped it, else the one
- * that lags most. */
-static PyObject *
-chain_deciding(Chain *self, PyObject *number)
+/* The edge whose error counts at a stamp that is not covered: the first that has dropped it, else the one that lags
+ * most; NULL if nothing moves. */
+static History *
+deciding_edge(const Chain *self, int64_t at)
 {
-    int64_t at, reached = INT64_MAX;
-    if (read_stamp(number, &at) < 0) {
-        return NULL;
-    }
-    PyObject *lagging = Py_None;
+    int64_t reached = INT64_MAX;
+    History *lagging = NULL;
     for (Py_ssize_t i = 0; i < self->up + self->down; i++) {
         History *edge = self->steps[i].edge;
         if (edge == NULL) {
             continue;
         }
-        lagging = lagging == Py_None ? OBJECT(edge) : lagging;
+        lagging = lagging == NULL ? edge : lagging;
         const Samples samples = samples_of(edge);
         const int64_t newest = samples.count == 0 ? INT64_MIN : samples.stamps[samples.count - 1];
         if (samples.count > 0 && newest >= at) {
             if (samples.stamps[0] > at) {
-                lagging = OBJECT(edge);
-                break;
+                return edge;
             }
         } else if (newest < reached) {
-            lagging = OBJECT(edge);
+            lagging = edge;
             reached = newest;
         }
     }
-    Py_INCREF(lagging);
     return lagging;
+}
+
+static PyObject *
+chain_deciding(Chain *self, PyObject *number)
+{
+    int64_t at;
+    if (read_stamp(number, &at) < 0) {
+        return NULL;
+    }
+    PyObject *edge = OBJECT(deciding_edge(self, at));
+    return Py_NewRef(edge == NULL ? Py_None : edge);
 }
 
 static PyObject *
@@ -255,7 +298,7 @@ chain_row(Chain *self, PyObject *number)
     if (at == -1 && PyErr_Occurred()) {
         return NULL;
     }
-    if (overflow || chain_at(self, at, row) != ANSWERED) {
+    if (overflow || chain_at(self, at, NULL, row) != ANSWERED) {
         Py_RETURN_NONE;
     }
     return boxed_row(row);
@@ -626,6 +669,7 @@ typedef struct {
     PyObject *latest;        /* the sentinel */
     PyObject *kind;          /* the class of an answer, made of Sample */
     PyObject *now;           /* the clock that ages are counted from, called for a stamp; None or NULL if there is none */
+    PyObject *qualified;     /* the class of an answer with a policy, derived from `kind`; None or NULL if there is none */
     long long inserted;      /* samples at new stamps */
     long long version;       /* another one after each change */
 } Paths;
@@ -643,7 +687,7 @@ paths_are_free(const Paths *self)
     return held == Py_False;
 }
 
-REFERENCES(paths, 5)
+REFERENCES(paths, 6)
 
 static int
 paths_init(Paths *self, PyObject *args, PyObject *kwargs)
@@ -686,11 +730,11 @@ paths_find(const Paths *self, PyObject *target, PyObject *source)
     return chain != NULL && PyObject_TypeCheck(chain, ChainType) ? (Chain *)chain : NULL;
 }
 
-/* The answer of a lookup. */
+/* The answer of a lookup, of a class that is made of Sample. */
 static PyObject *
-paths_sample(const Paths *self, PyObject *target, PyObject *source, int64_t at, const double *row, int is_static)
+make_answer(PyObject *kind, PyObject *target, PyObject *source, int64_t at, const double *row, int is_static)
 {
-    Sample *sample = (Sample *)PyType_GenericAlloc((PyTypeObject *)self->kind, 0);
+    Sample *sample = (Sample *)PyType_GenericAlloc((PyTypeObject *)kind, 0);
     if (sample == NULL) {
         return NULL;
     }
@@ -706,6 +750,20 @@ paths_sample(const Paths *self, PyObject *target, PyObject *source, int64_t at, 
     return (PyObject *)sample;
 }
 
+/* Whether it is known which stamp is asked for, by an int or by `LATEST`. */
+static int
+paths_stamp(const Paths *self, const Chain *path, PyObject *at, int64_t *stamp)
+{
+    int overflow = 1;
+    if (at == self->latest) {
+        return chain_newest(path, stamp);
+    }
+    if (PyLong_CheckExact(at)) {
+        *stamp = PyLong_AsLongLongAndOverflow(at, &overflow);
+    }
+    return !overflow;
+}
+
 /* None where Python has to look closer. */
 static PyObject *
 paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
@@ -716,32 +774,86 @@ paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
         PyErr_SetString(PyExc_TypeError, "answer takes target, source and at");
         return NULL;
     }
-    PyObject *target = args[0], *source = args[1];
+    const Chain *path = paths_find(self, args[0], args[1]);
+    if (path == NULL && PyErr_Occurred()) {
+        return NULL;
+    }
+    if (path == NULL || path->up + path->down == 0 || !paths_stamp(self, path, args[2], &at)
+        || chain_at(path, at, NULL, row) != ANSWERED) {
+        Py_RETURN_NONE;
+    }
+    return make_answer(self->kind, args[0], args[1], at, row, path->moving == 0);
+}
+
+/* As `paths_answer`, as far as a policy allows: `Extrapolation` of tfbus/tree/lookup.py. */
+static PyObject *
+paths_answer_within(const Paths *self, PyObject *target, PyObject *source, PyObject *at, Policy *policy)
+{
+    int64_t stamp;
+    double row[WIDTH];
+    PyObject *kind = self->qualified;
+    if (kind == NULL || !PyType_Check(kind) || !PyType_IsSubtype((PyTypeObject *)kind, SampleType)) {
+        Py_RETURN_NONE;
+    }
     const Chain *path = paths_find(self, target, source);
-    if (path == NULL) {
-        if (PyErr_Occurred()) {
-            return NULL;
-        }
+    if (path == NULL && PyErr_Occurred()) {
+        return NULL;
+    }
+    if (path == NULL || path->up + path->down == 0 || !paths_stamp(self, path, at, &stamp)) {
         Py_RETURN_NONE;
     }
-    if (args[2] == self->latest) {
-        if (!chain_newest(path, &at)) {
-            Py_RETURN_NONE;
-        }
-    } else {
-        int overflow;
-        if (path->up + path->down == 0 || !PyLong_CheckExact(args[2])) {
-            Py_RETURN_NONE;
-        }
-        at = PyLong_AsLongLongAndOverflow(args[2], &overflow);
-        if (overflow) {
-            Py_RETURN_NONE;
-        }
+    const int is_static = path->moving == 0;
+    if (at == self->latest && !is_static) {
+        stamp = chain_newest_within(path, stamp, policy->hold);
     }
-    if (chain_at(path, at, row) != ANSWERED) {
+    if (!(path->alone || chain_covers(path, stamp)) || chain_at(path, stamp, policy, row) != ANSWERED) {
         Py_RETURN_NONE;
     }
-    return paths_sample(self, target, source, at, row, path->moving == 0);
+    PyObject *use = Py_BuildValue("KK", policy->extrapolated_by, policy->gap);
+    PyObject *answer = use == NULL ? NULL : make_answer(kind, target, source, stamp, row, is_static);
+    if (answer != NULL && PyObject_SetAttr(answer, policy_use_string, use) < 0) {
+        Py_CLEAR(answer);
+    }
+    Py_XDECREF(use);
+    return answer;
+}
+
+/* The clock's now; 0 if there is no clock, or Python has to look closer, perhaps with an error. */
+static int
+paths_now(const Paths *self, int64_t *now)
+{
+    PyObject *number = self->now == NULL || self->now == Py_None ? NULL : PyObject_CallNoArgs(self->now);
+    const int known = number != NULL && PyLong_CheckExact(number) && read_stamp(number, now) == 0;
+    Py_XDECREF(number);
+    return known;
+}
+
+/* Raise the error of a lookup at a stamp that a known path does not cover, if there is no other way, and the clock shows
+ * that no sample of the deciding edge is ahead of it. Python words it, and here saves five calls on the way there. */
+static void
+paths_refuse(const Paths *self, PyObject *target, PyObject *source, PyObject *number)
+{
+    int64_t at, now = INT64_MAX;
+    int overflow = 1;
+    Chain *path = PyLong_CheckExact(number) ? paths_find(self, target, source) : NULL;
+    if (path != NULL) {
+        at = PyLong_AsLongLongAndOverflow(number, &overflow);
+    }
+    if (overflow || !path->alone || path->moving == 0 || chain_covers(path, at)) {
+        return;
+    }
+    History *edge = deciding_edge(path, at);
+    const int64_t newest = edge->end > edge->start ? block_stamps(edge->block)[edge->end - 1] : INT64_MIN;
+    Py_INCREF(OBJECT(path));
+    if (self->now == NULL || self->now == Py_None || paths_now(self, &now)) {
+        PyObject *error = newest > now ? NULL : PyObject_CallMethodObjArgs(OBJECT(edge), error_string, number, NULL);
+        /* Another thread may have inserted the missing samples meanwhile. */
+        if (error != NULL && !chain_covers(path, at) && PyExceptionInstance_Check(error)) {
+            PyErr_SetObject(OBJECT(Py_TYPE(error)), error);
+        }
+        Py_XDECREF(error);
+    }
+    Py_DECREF(OBJECT(path));
 }
 
 /* One half of a time travel: source in target at a stamp or at `LATEST`; then `*stamp` is the stamp that counts, and
@@ -750,21 +862,11 @@ static int
 paths_half(const Paths *self, PyObject *target, PyObject *source, PyObject *at, int64_t *stamp, double *row, int *is_static)
 {
     const Chain *path = paths_find(self, target, source);
-    int overflow = 0;
-    if (path == NULL) {
-        return 0;
-    }
-    if (at == self->latest) {
-        if (path->up + path->down == 0 || !chain_newest(path, stamp)) {
-            return 0;
-        }
-    } else if (PyLong_CheckExact(at)) {
-        *stamp = PyLong_AsLongLongAndOverflow(at, &overflow);
-    } else {
+    if (path == NULL || !paths_stamp(self, path, at, stamp)) {
         return 0;
     }
     *is_static = path->moving == 0;
-    return !overflow && chain_at(path, *stamp, row) == ANSWERED;
+    return chain_at(path, *stamp, NULL, row) == ANSWERED;
 }
 
 /* As `paths_answer`, of source at its own stamp, carried through a fixed frame into target: `find_in_time_travel` of
@@ -786,7 +888,7 @@ paths_travel(const Paths *self, PyObject *target, PyObject *source, PyObject *at
     if (at == self->latest && target_static && !source_static) {
         stamp = source_stamp;
     }
-    return paths_sample(self, target, source, stamp, second, target_static && source_static);
+    return make_answer(self->kind, target, source, stamp, second, target_static && source_static);
 }
 
 /* can_answer(target, source, at): whether there is an answer; None where Python has to look closer. */
@@ -986,6 +1088,7 @@ static PyMemberDef paths_members[] = {
     {"inserted", T_LONGLONG, offsetof(Paths, inserted), 0, PyDoc_STR("The number of samples at new stamps.")},
     {"version", T_LONGLONG, offsetof(Paths, version), 0, PyDoc_STR("Another number after each change.")},
     {"now", T_OBJECT, offsetof(Paths, now), 0, PyDoc_STR("The clock that ages are counted from: it gives a stamp.")},
+    {"qualified", T_OBJECT, offsetof(Paths, qualified), 0, PyDoc_STR("The class of an answer with a policy.")},
     {NULL}
 };
 
@@ -1074,6 +1177,12 @@ method_answer(const Method *self, PyObject *asker, PyObject *target, PyObject *s
     }
     PyObject *question[3] = {target, source, at == NULL ? paths->latest : at};
     PyObject *found = self->many == NULL ? paths_answer(paths, question, 3) : paths_answer_many(paths, question, 3);
+    if (self->many == NULL && found == Py_None) {
+        paths_refuse(paths, target, source, question[2]);
+        if (PyErr_Occurred()) {
+            Py_CLEAR(found);
+        }
+    }
     Py_DECREF(OBJECT(paths));
     if (self->many == NULL || found == NULL || found == Py_None) {
         return found;
@@ -1130,28 +1239,44 @@ typedef struct {
     int64_t oldest, newest;
 } Bounds;
 
+/* The ns of a duration in s, a float; 0 for any other object, and for more than thirty years. */
+static int
+read_duration(PyObject *duration, uint64_t *nanoseconds)
+{
+    const double seconds = PyFloat_CheckExact(duration) ? PyFloat_AsDouble(duration) : -1.0, whole = floor(seconds);
+    if (!(0.0 <= seconds && seconds <= 1e9)) {
+        return 0;
+    }
+    *nanoseconds = (uint64_t)whole * 1000000000 + (uint64_t)nearbyint((seconds - whole) * 1e9);
+    return 1;
+}
+
+/* The ns of a `Hold` of tfbus/tree/lookup.py; 0 for any other object. */
+static int
+read_hold(PyObject *hold, uint64_t *nanoseconds)
+{
+    PyObject *number = PyObject_GetAttr(hold, nanoseconds_string);
+    int64_t value = -1;
+    if (number == NULL || !PyLong_CheckExact(number) || read_stamp(number, &value) < 0) {
+        PyErr_Clear();
+    }
+    Py_XDECREF(number);
+    *nanoseconds = (uint64_t)value;
+    return value >= 0;
+}
+
 /* Ages of a duration in s around the clock's now, as `Lookups.bounds` in tfbus/buffer/lookups.py gives them; 0 where
  * Python has to look closer, perhaps with an error. */
 static int
 bounds_of_age(const Paths *paths, PyObject *max_age, Bounds *bounds)
 {
-    if (!PyFloat_CheckExact(max_age) || paths->now == NULL || paths->now == Py_None) {
-        return 0;
-    }
-    const double seconds = PyFloat_AsDouble(max_age), whole = floor(seconds);
-    if (!(0.0 <= seconds && seconds <= 1e9)) {
-        return 0;
-    }
-    PyObject *number = PyObject_CallNoArgs(paths->now);
+    uint64_t age;
     int64_t now;
-    const int known = number != NULL && PyLong_CheckExact(number) && read_stamp(number, &now) == 0;
-    Py_XDECREF(number);
-    if (!known || now < -(INT64_MAX / 2) || now > INT64_MAX / 2) {
+    if (!read_duration(max_age, &age) || !paths_now(paths, &now) || now < -(INT64_MAX / 2) || now > INT64_MAX / 2) {
         return 0;
     }
-    const int64_t age = (int64_t)whole * 1000000000 + (int64_t)nearbyint((seconds - whole) * 1e9);
-    bounds->oldest = now - age;
-    bounds->newest = now + age;
+    bounds->oldest = now - (int64_t)age;
+    bounds->newest = now + (int64_t)age;
     return 1;
 }
 
@@ -1165,15 +1290,16 @@ read_bound(PyObject *number, int64_t *bound)
     return !overflow;
 }
 
-/* The answer of a call with options that the kernel knows: time travel, or the age of `LATEST`. None for any other, and
- * where there is no such answer. Not inlined, as above. */
+/* The answer of a call with options that the kernel knows: time travel, or the age of `LATEST` and a policy. None for
+ * any other, and where there is no such answer. Not inlined, as above. */
 Py_NO_INLINE static PyObject *
 method_answer_with(const Method *self, PyObject *const *args, PyObject *at, PyObject *const *named, PyObject *names,
                    Py_ssize_t first)
 {
     PyObject *source_at = Py_None, *fixed = Py_None;
     Bounds bounds = {INT64_MIN, INT64_MAX};
-    int plain = 1, bounded = 0;
+    Policy policy = {0, UINT64_MAX, 0, 0, 0};
+    int plain = 1, bounded = 0, limited = 0;
     Paths *paths = paths_of(args[0]);
     if (paths == NULL) {
         Py_RETURN_NONE;
@@ -1187,7 +1313,14 @@ method_answer_with(const Method *self, PyObject *const *args, PyObject *at, PyOb
             source_at = named[i];
         } else if (name == fixed_string) {
             fixed = named[i];
-        } else if (by_default != named[i]) {
+        } else if (by_default == named[i]) {
+            continue;
+        } else if ((name == tolerance_string && read_duration(named[i], &policy.tolerance))
+                   || (name == max_gap_string && read_duration(named[i], &policy.max_gap))
+                   || (name == extrapolate_string && read_hold(named[i], &policy.hold))) {
+            /* As in `policy_of`, a tolerance of zero is none. */
+            limited |= name != tolerance_string || PyFloat_AsDouble(named[i]) != 0.0;
+        } else {
             plain = (name == not_before_string && read_bound(named[i], &bounds.oldest))
                     || (name == not_after_string && read_bound(named[i], &bounds.newest))
                     || (name == max_age_string && bounds_of_age(paths, named[i], &bounds));
@@ -1199,12 +1332,12 @@ method_answer_with(const Method *self, PyObject *const *args, PyObject *at, PyOb
     if (PyErr_Occurred()) {
         answer = NULL;
     } else if (!plain || (source_at == Py_None) != (fixed == Py_None)
-               || (bounded && (fixed != Py_None || when != paths->latest))) {
+               || (bounded && (fixed != Py_None || when != paths->latest)) || (limited && fixed != Py_None)) {
         Py_INCREF(answer);
     } else if (fixed != Py_None) {
         answer = paths_travel(paths, args[1], args[2], when, source_at, fixed);
     } else {
-        answer = paths_answer(paths, question, 3);
+        answer = limited ? paths_answer_within(paths, args[1], args[2], when, &policy) : paths_answer(paths, question, 3);
         const Sample *sample = (const Sample *)answer;
         if (answer != NULL && answer != Py_None && !sample->is_static
             && !(bounds.oldest <= sample->stamp && sample->stamp <= bounds.newest)) {

@@ -2,9 +2,9 @@
  *
  * An Edge is what the bus knows of a frame's newest edge; the Judge accepts a batch whose samples all continue known
  * edges from their trusted authority, at plausible stamps. It changes nothing before it has accepted the whole batch.
- * An Intake is the way of plain batches from `publish` to the Feed of each buffer, if nobody else listens. A batch that
- * the Judge does not accept is Python's, with all its reasons and events; a buffer whose Feed does not take a batch gets
- * it in the ordinary way.
+ * An Intake is the way of plain batches from `publish` to the Feed of each tree, and then to those who listen besides.
+ * A batch that the Judge does not accept is Python's, with all its reasons and events; a tree whose Feed does not take a
+ * batch gets it in the ordinary way.
  *
  * `decode` reads the samples of a tf message up to the first whose names are new or whose numbers need a correction.
  */
@@ -266,21 +266,23 @@ typedef struct {
     PyObject *feeds;
     PyObject *judge;      /* Judge */
     PyObject *kind;       /* the class of samples */
-    PyObject *listeners;  /* a tuple of containers; their elements need each batch */
+    PyObject *tell;       /* called with each batch while a container of `listeners` has elements */
+    PyObject *listeners;  /* a tuple of containers */
+    PyObject *busy;       /* a tuple of containers; nothing is taken while one of them has elements */
     long long samples;    /* how many were taken */
     unsigned long thread; /* the only one that may publish */
     char open;
 } Intake;
 
-REFERENCES(intake, 4)
+REFERENCES(intake, 6)
 
 static int
 intake_init(Intake *self, PyObject *args, PyObject *kwargs)
 {
-    PyObject *judge, *kind, *listeners;
+    PyObject *judge, *kind, *tell, *listeners, *busy;
     if (!has_no_keywords(kwargs)
-        || !PyArg_ParseTuple(args, "O!O!O!:Intake", JudgeType, &judge, &PyType_Type, &kind, &PyTuple_Type,
-                             &listeners)) {
+        || !PyArg_ParseTuple(args, "O!O!OO!O!:Intake", JudgeType, &judge, &PyType_Type, &kind, &tell, &PyTuple_Type,
+                             &listeners, &PyTuple_Type, &busy)) {
         return -1;
     }
     if (self->feeds != NULL) {
@@ -293,10 +295,14 @@ intake_init(Intake *self, PyObject *args, PyObject *kwargs)
     }
     Py_INCREF(judge);
     Py_INCREF(kind);
+    Py_INCREF(tell);
     Py_INCREF(listeners);
+    Py_INCREF(busy);
     self->judge = judge;
     self->kind = kind;
+    self->tell = tell;
     self->listeners = listeners;
+    self->busy = busy;
     self->feeds = feeds;
     self->open = 1;
     return 0;
@@ -333,7 +339,19 @@ intake_batch(const Intake *self, PyObject *samples)
     return batch;
 }
 
-/* take(samples, invalid): judge a batch and insert it into all buffers if it is plain and nobody else listens. Returns
+/* Whether one of some containers has elements; -1 for an error. */
+static int
+has_any(PyObject *containers)
+{
+    const Py_ssize_t count = PyTuple_Size(containers);
+    Py_ssize_t size = 0;
+    for (Py_ssize_t i = 0; i < count && size == 0; i++) {
+        size = PyObject_Size(PyTuple_GetItem(containers, i));
+    }
+    return size < 0 ? -1 : size > 0;
+}
+
+/* take(samples, invalid): judge a batch, insert it into all trees and tell those who listen, if it is plain. Returns
  * True then; None if the judge does not accept it; False if the judge was not asked. */
 static PyObject *
 intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
@@ -346,12 +364,9 @@ intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
         || (args[1] != raise_string && args[1] != drop_string)) {
         Py_RETURN_FALSE;
     }
-    const Py_ssize_t containers = PyTuple_Size(self->listeners);
-    for (Py_ssize_t i = 0; i < containers; i++) {
-        const Py_ssize_t size = PyObject_Size(PyTuple_GetItem(self->listeners, i));
-        if (size != 0) {
-            return size < 0 ? NULL : PyBool_FromLong(0);
-        }
+    const int busy = has_any(self->busy);
+    if (busy != 0) {
+        return busy < 0 ? NULL : PyBool_FromLong(0);
     }
     PyObject *batch = intake_batch(self, args[0]);
     if (batch == NULL) {
@@ -386,6 +401,18 @@ intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
         Py_XDECREF(done);
     }
     Py_DECREF(feeds);
+    const int heard = has_any(self->listeners);
+    if (heard > 0) {
+        PyObject *objects = PyTuple_CheckExact(batch) ? Py_NewRef(batch) : columns_samples(batch, self->kind);
+        PyObject *told = objects == NULL ? NULL : PyObject_CallFunctionObjArgs(self->tell, objects, NULL);
+        Py_XDECREF(objects);
+        if (told == NULL) {
+            set_aside(&trouble);
+        }
+        Py_XDECREF(told);
+    } else if (heard < 0) {
+        set_aside(&trouble);
+    }
     Py_DECREF(batch);
     if (raise_trouble(&trouble)) {
         Py_CLEAR(accepted);
@@ -426,8 +453,8 @@ intake_set_feeds(Intake *self, PyObject *value, void *Py_UNUSED(closure))
 
 static PyMethodDef intake_methods[] = {
     {"take", FAST(intake_take), METH_FASTCALL,
-     PyDoc_STR("take(samples, invalid): judge a batch and insert it into all buffers if it is plain and nobody else "
-               "listens: True; None if the judge does not accept it, False if it was not asked.")},
+     PyDoc_STR("take(samples, invalid): judge a batch, insert it into all trees and tell listeners if it is plain: "
+               "True; None if the judge does not accept it, False if it was not asked.")},
     {NULL}
 };
 

@@ -1171,10 +1171,18 @@ samples_of(const History *edge)
 static Status
 find_segment(const Samples *samples, int64_t at, Segment *segment)
 {
-    if (samples->count == 0 || at < samples->stamps[0] || at > samples->stamps[samples->count - 1]) {
+    const Py_ssize_t last = samples->count - 1;
+    if (last < 0 || at > samples->stamps[last]) {
         return MISSING;
     }
-    const Py_ssize_t i = lower_bound(samples->stamps, samples->count, at);
+    /* Behind the last but one are most of the stamps that `LATEST` asks for. */
+    Py_ssize_t i = last;
+    if (at != samples->stamps[last] && (last == 0 || at <= samples->stamps[last - 1])) {
+        if (at < samples->stamps[0]) {
+            return MISSING;
+        }
+        i = lower_bound(samples->stamps, samples->count, at);
+    }
     segment->after = samples->stamps[i];
     segment->a = NULL;
     segment->b = samples->rows + WIDTH * i;
@@ -1184,6 +1192,51 @@ find_segment(const Samples *samples, int64_t at, Segment *segment)
     segment->before = samples->stamps[i - 1];
     segment->a = segment->b - WIDTH;
     return (uint64_t)segment->after - (uint64_t)segment->before > EXACT_GAP ? NOT_PLAIN : ANSWERED;
+}
+
+/* How far an answer may depart from its stamp: `Policy` of tfbus/tree/lookup.py, in ns; and how far it does. */
+typedef struct {
+    uint64_t tolerance, max_gap, hold; /* `max_gap` is UINT64_MAX for any */
+    uint64_t extrapolated_by, gap;     /* the greatest over all edges */
+} Policy;
+
+static uint64_t
+greater(uint64_t a, uint64_t b)
+{
+    return a > b ? a : b;
+}
+
+/* As `find_segment`, as far as a policy allows: `read_stamp` of tfbus/tree/lookup.py. */
+static Status
+find_segment_within(const Samples *samples, int64_t at, Policy *policy, Segment *segment)
+{
+    const Status status = find_segment(samples, at, segment);
+    const Py_ssize_t last = samples->count - 1;
+    uint64_t late = UINT64_MAX, early = UINT64_MAX;
+    if (status == NOT_PLAIN || last < 0 || (status == ANSWERED && segment->a == NULL)) {
+        return status;
+    }
+    if (status == ANSWERED) {
+        const uint64_t gap = (uint64_t)segment->after - (uint64_t)segment->before;
+        if (gap <= policy->max_gap) {
+            policy->gap = greater(policy->gap, gap);
+            return ANSWERED;
+        }
+        late = (uint64_t)at - (uint64_t)segment->before;
+        early = (uint64_t)segment->after - (uint64_t)at;
+    } else if (at > samples->stamps[last]) {
+        late = (uint64_t)at - (uint64_t)samples->stamps[last];
+        segment->a = samples->rows + WIDTH * last;
+    } else {
+        early = (uint64_t)samples->stamps[0] - (uint64_t)at;
+        segment->b = samples->rows;
+    }
+    const int by_before = late <= greater(policy->tolerance, policy->hold);
+    const int by_after = early <= policy->tolerance && !(by_before && late <= early);
+    segment->b = by_after ? segment->b : segment->a;
+    segment->a = NULL;
+    policy->extrapolated_by = greater(policy->extrapolated_by, by_after ? early : late);
+    return by_before || by_after ? ANSWERED : MISSING;
 }
 
 enum { LANES = 32 }; /* rows that are made at once */

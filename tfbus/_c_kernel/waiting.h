@@ -1,10 +1,18 @@
 /* Waiting: the lookups that are parked until a sample comes, and the insertion that wakes them.
  *
  * A Parked is one waiting lookup. A Line is the lookups under one frame; its `places` are sorted so that the next one due
- * is the last. A Feed is the way of plain batches into one buffer: it stores the batch, pops from the lines of its frames
- * whoever is due, and calls `wake` with the answer already found, if that is plain. It takes a batch only if the lines
- * need nothing else: nobody waits for any sample, no limit is passed, and nobody watches the frames. Else it does
- * nothing, and Python inserts and wakes.
+ * is the last. A Feed is the plain way into and out of the waiting lookups of one buffer.
+ *
+ * `ask` gives a Parked to be awaited: a turn of the loop, then the answer, or a wait for the insertion that brings it. The
+ * event loop is Python's: `begin` makes the wake-up, notes the time and sets the alarms, and gives the iterator that
+ * sleeps. The result is None where the question is not plain, or the answer did not hold until the task ran; then a
+ * coroutine in Python goes on. It awaits the Parked, so an exception (a cancellation) is thrown into that coroutine, which
+ * removes the Parked from the index; there is no `throw` here.
+ * `park` puts a lookup in the line of the edge that lags most, if newer samples are all that it lacks. It makes no error,
+ * which says the same in words and takes many times as long: Python words it when somebody asks what blocks the lookup.
+ * `insert` stores a batch, pops from the lines of its frames whoever is due, and calls `wake` with the answer already
+ * found, if that is plain. It takes a batch only if the lines need nothing else: nobody waits for any sample, no limit is
+ * passed, and nobody watches the frames. Where one of the two does nothing, Python parks, or inserts and wakes.
  *
  * Calling `wake` runs Python code, which may change everything here. So a waiter leaves its line before it is called,
  * and nothing is remembered across the call but references of our own.
@@ -14,29 +22,106 @@
 
 typedef struct {
     PyObject_HEAD
-    PyObject *plain;   /* target, source and at of a plain question; None of another */
-    PyObject *wake;    /* called without arguments, once */
-    PyObject *place;   /* its place in a line, if it has one */
-    PyObject *answer;  /* the answer of the insertion that woke it */
-    long long version; /* of the paths, when they had this answer */
-    char elsewhere;    /* whether it is noted elsewhere than in a line and among all parked lookups */
+    PyObject *asked;    /* a tuple: target, source, at, and options that are all None if it is plain */
+    PyObject *wake;     /* called without arguments, once */
+    PyObject *place;    /* its place in a line, if it has one */
+    PyObject *answer;   /* the answer of the insertion that woke it */
+    PyObject *names;    /* the frames that block it, a tuple */
+    PyObject *limit;    /* its place among the first limits, if it has one */
+    PyObject *feed;     /* the Feed that it asks, while it is awaited */
+    PyObject *sleeper;  /* the iterator that sleeps until `wake` is called */
+    long long since;    /* when it began to wait, in ns */
+    long long version;  /* of the paths, when they had this answer */
+    char elsewhere;     /* whether Python has noted it elsewhere, and has to forget it */
+    char step;          /* of those below */
+    char turned;        /* whether it has taken a turn of the loop */
 } Parked;
 
-REFERENCES(parked, 4)
+enum { NOT_AWAITED, BEFORE_TURN, AFTER_TURN, ASLEEP };
+
+REFERENCES(parked, 8)
+
+static PySendResult parked_step(PyObject *self, PyObject *value, PyObject **result);
+
+/* `send` of an iterator: what it yields; StopIteration with the result at its end. */
+static PyObject *
+parked_send(PyObject *self, PyObject *value)
+{
+    PyObject *result;
+    const PySendResult sent = parked_step(self, value, &result);
+    if (sent == PYGEN_RETURN) {
+        /* Made here, because a result that is a tuple would become the arguments. */
+        PyObject *stop = PyObject_CallFunctionObjArgs(PyExc_StopIteration, result, NULL);
+        Py_DECREF(result);
+        if (stop != NULL) {
+            PyErr_SetObject(PyExc_StopIteration, stop);
+            Py_DECREF(stop);
+        }
+        return NULL;
+    }
+    return sent == PYGEN_NEXT ? result : NULL;
+}
+
+static PyObject *
+parked_next(PyObject *self)
+{
+    return parked_send(self, Py_None);
+}
+
+static PyObject *
+parked_await(PyObject *self)
+{
+    Py_INCREF(self);
+    return self;
+}
+
+static PyMethodDef parked_methods[] = {
+    {"send", (PyCFunction)parked_send, METH_O, PyDoc_STR("send(value): go on; as that of a coroutine.")},
+    {NULL}
+};
+
+static int
+parked_init(Parked *self, PyObject *args, PyObject *kwargs)
+{
+    static char *names[] = {"asked", "since", "wake", NULL};
+    PyObject *asked, *wake;
+    long long since;
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "OLO:Parked", names, &asked, &since, &wake)) {
+        return -1;
+    }
+    PyObject *old[] = {self->asked, self->wake};
+    Py_INCREF(asked);
+    Py_INCREF(wake);
+    self->asked = asked;
+    self->wake = wake;
+    self->since = since;
+    Py_XDECREF(old[0]);
+    Py_XDECREF(old[1]);
+    return 0;
+}
 
 static PyMemberDef parked_members[] = {
-    {"plain", T_OBJECT, offsetof(Parked, plain), 0, PyDoc_STR("Target, source and at of a plain question, or None.")},
+    {"asked", T_OBJECT, offsetof(Parked, asked), 0, PyDoc_STR("Target, source, at, and the options.")},
     {"wake", T_OBJECT, offsetof(Parked, wake), 0, PyDoc_STR("Called once, after it was taken out of its line.")},
     {"place", T_OBJECT, offsetof(Parked, place), 0, PyDoc_STR("Its place in a line, or None.")},
     {"answer", T_OBJECT, offsetof(Parked, answer), 0, PyDoc_STR("The answer of the insertion that woke it, or None.")},
+    {"names", T_OBJECT, offsetof(Parked, names), 0, PyDoc_STR("The frames that block it.")},
+    {"limit", T_OBJECT, offsetof(Parked, limit), 0, PyDoc_STR("Its place among the first limits, or None.")},
+    {"since", T_LONGLONG, offsetof(Parked, since), 0, PyDoc_STR("When it began to wait, in ns.")},
     {"version", T_LONGLONG, offsetof(Parked, version), 0, PyDoc_STR("The version of the paths that gave this answer.")},
-    {"elsewhere", T_BOOL, offsetof(Parked, elsewhere), 0, PyDoc_STR("Whether more than its line has to forget it.")},
+    {"elsewhere", T_BOOL, offsetof(Parked, elsewhere), 0, PyDoc_STR("Whether Python has to forget it.")},
     {NULL}
 };
 
 static PyType_Slot parked_slots[] = {
-    {Py_tp_doc, (void *)PyDoc_STR("The part of a parked lookup that a wake-up needs.")},
+    {Py_tp_doc, (void *)PyDoc_STR("Parked(asked, since, wake): the part of a parked lookup that a wake-up needs.")},
     {Py_tp_new, PyType_GenericNew},
+    {Py_tp_init, parked_init},
+    {Py_am_await, parked_await},
+    {Py_am_send, parked_step},
+    {Py_tp_iter, parked_await},
+    {Py_tp_iternext, parked_next},
+    {Py_tp_methods, parked_methods},
     {Py_tp_dealloc, parked_dealloc},
     {Py_tp_traverse, parked_traverse},
     {Py_tp_clear, parked_clear},
@@ -100,7 +185,7 @@ static PyType_Spec line_spec = {
     "tfbus._kernel.Line", sizeof(Line), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, line_slots
 };
 
-enum { PATHS, FRAMES, READERS, LINES, PARKED, LIMITS, WATCHES, FORGET, PARTS };
+enum { PATHS, FRAMES, READERS, LINES, PARKED, LIMITS, WATCHES, INDEX, ORDERS, FORGET, KIND, BEGIN, PARTS };
 
 typedef struct {
     PyObject_HEAD
@@ -116,15 +201,27 @@ feed_init(Feed *self, PyObject *args, PyObject *kwargs)
     if (!has_no_keywords(kwargs)
         || !PyArg_ParseTuple(args, "O!O!O!O!O!O!O!O:Feed", PathsType, &parts[PATHS], &PyDict_Type, &parts[FRAMES],
                              &PyDict_Type, &parts[READERS], &PyDict_Type, &parts[LINES], &PyDict_Type, &parts[PARKED],
-                             &PyList_Type, &parts[LIMITS], &PyDict_Type, &parts[WATCHES], &parts[FORGET])) {
+                             &PyList_Type, &parts[LIMITS], &PyDict_Type, &parts[WATCHES], &parts[INDEX])) {
         return -1;
     }
     if (self->parts[PATHS] != NULL) {
         PyErr_SetString(PyExc_RuntimeError, "a Feed is initialised once, because it may be at work");
         return -1;
     }
-    for (int i = 0; i < PARTS; i++) {
-        Py_INCREF(parts[i]);
+    parts[ORDERS] = PyObject_GetAttrString(parts[INDEX], "orders");
+    parts[FORGET] = parts[ORDERS] == NULL ? NULL : PyObject_GetAttrString(parts[INDEX], "forget");
+    if (parts[FORGET] == NULL || !PyIter_Check(parts[ORDERS])) {
+        Py_XDECREF(parts[ORDERS]);
+        Py_XDECREF(parts[FORGET]);
+        if (!PyErr_Occurred()) {
+            PyErr_SetString(PyExc_TypeError, "the orders must be an iterator");
+        }
+        return -1;
+    }
+    for (int i = 0; i <= FORGET; i++) {
+        if (i != ORDERS && i != FORGET) {
+            Py_INCREF(parts[i]);
+        }
         self->parts[i] = parts[i];
     }
     return 0;
@@ -145,6 +242,298 @@ is_reached(PyObject *place, int64_t stamp)
     }
     /* The negative of the least stamp is too great, and every stamp has reached that. */
     return overflow > 0 || (overflow == 0 && (stamp != INT64_MIN && negative >= -stamp));
+}
+
+/* Target, source and at of a waiter's plain question, borrowed; 0 if it is not plain. */
+static int
+is_plain(const Parked *waiter, PyObject **asked)
+{
+    PyObject *question = waiter->asked;
+    const Py_ssize_t size = question != NULL && PyTuple_Check(question) ? PyTuple_Size(question) : 0;
+    for (Py_ssize_t i = 0; i < size; i++) {
+        PyObject *item = PyTuple_GetItem(question, i);
+        if (i < 3) {
+            asked[i] = item;
+        } else if (item != Py_None) {
+            return 0;
+        }
+    }
+    return size >= 3;
+}
+
+/* The index of the first place in a sorted list that is not less than `place`; -1 for an error. */
+static Py_ssize_t
+place_index(PyObject *places, PyObject *place)
+{
+    Py_ssize_t low = 0, high = PyList_Size(places);
+    while (low < high) {
+        const Py_ssize_t middle = (low + high) / 2;
+        const int less = PyObject_RichCompareBool(PyList_GetItem(places, middle), place, Py_LT);
+        if (less < 0) {
+            return -1;
+        }
+        low = less ? middle + 1 : low;
+        high = less ? high : middle;
+    }
+    return low;
+}
+
+/* Put (-stamp, -order, waiter) into a sorted list, and into `place`. */
+static int
+line_up(PyObject *places, PyObject **place, Parked *waiter, int64_t stamp, PyObject *orders)
+{
+    PyObject *order = PyIter_Next(orders);
+    const long long number = order == NULL ? -1 : PyLong_AsLongLong(order);
+    Py_XDECREF(order);
+    if (number < 0) {
+        if (!PyErr_Occurred()) {
+            PyErr_SetString(PyExc_ValueError, "the orders end, or are negative");
+        }
+        return -1;
+    }
+    PyObject *made = Py_BuildValue("(LLO)", (long long)-stamp, -number, OBJECT(waiter));
+    const Py_ssize_t index = made == NULL ? -1 : place_index(places, made);
+    if (index < 0 || PyList_Insert(places, index, made) < 0) {
+        Py_XDECREF(made);
+        return -1;
+    }
+    PyObject *old = *place;
+    *place = made;
+    Py_XDECREF(old);
+    return 0;
+}
+
+/* Forget the limit of a waiter, if it has one. */
+static int
+drop_limit(PyObject *limits, Parked *waiter)
+{
+    PyObject *limit = waiter->limit;
+    if (limit == NULL || !PyTuple_CheckExact(limit)) {
+        return 0;
+    }
+    waiter->limit = NULL;
+    const Py_ssize_t index = place_index(limits, limit);
+    const int failed = index < 0 || (index < PyList_Size(limits) && PyList_GetItem(limits, index) == limit
+                                     && PyList_SetSlice(limits, index, index + 1, NULL) < 0);
+    Py_DECREF(limit);
+    return failed ? -1 : 0;
+}
+
+/* The edge of a path that lags most, if only newer samples are missing at a stamp; borrowed. `limit` becomes the newest
+ * stamp that any other edge may reach before it loses this one. */
+static const History *
+lagging_edge(const Chain *path, int64_t at, int64_t *limit)
+{
+    const History *lagging = NULL;
+    int64_t least = INT64_MAX;
+    *limit = INT64_MAX;
+    for (Py_ssize_t i = 0; i < path->up + path->down; i++) {
+        const History *edge = path->steps[i].edge;
+        if (edge == NULL) {
+            continue;
+        }
+        const Samples samples = samples_of(edge);
+        if (edge->mixed || samples.count == 0 || at < samples.stamps[0]) {
+            return NULL;
+        }
+        const int64_t newest = samples.stamps[samples.count - 1];
+        if (newest < at && newest < least) {
+            least = newest;
+            lagging = edge;
+        }
+    }
+    for (Py_ssize_t i = 0; lagging != NULL && i < path->up + path->down; i++) {
+        const History *edge = path->steps[i].edge;
+        if (edge == NULL || edge == lagging || edge->keep < 0) {
+            continue;
+        }
+        const Samples samples = samples_of(edge);
+        const Py_ssize_t next = lower_bound(samples.stamps, samples.count, at);
+        const int exact = next < samples.count && samples.stamps[next] == at;
+        const int64_t before = samples.stamps[exact ? next : next - 1];
+        int64_t lasts = before > INT64_MAX - edge->keep ? INT64_MAX : before + edge->keep;
+        if (next + exact == samples.count && lasts < at) {
+            lasts = at;
+        }
+        *limit = lasts < *limit ? lasts : *limit;
+    }
+    return lagging;
+}
+
+/* Put a waiter into the line of a frame, and its first limit among the limits. */
+static int
+feed_line_up(const Feed *self, Parked *waiter, PyObject *child, int64_t at, int64_t limit)
+{
+    PyObject *lines = self->parts[LINES], *orders = self->parts[ORDERS];
+    PyObject *names = PyTuple_Pack(1, child), *old = waiter->names;
+    if (names == NULL) {
+        return -1;
+    }
+    waiter->names = names;
+    Py_XDECREF(old);
+    if (PyDict_SetItem(self->parts[PARKED], OBJECT(waiter), Py_None) < 0) {
+        return -1;
+    }
+    PyObject *line = PyDict_GetItemWithError(lines, child);
+    Py_XINCREF(line);
+    if (line == NULL) {
+        line = PyErr_Occurred() ? NULL : PyObject_CallNoArgs(OBJECT(LineType));
+        if (line == NULL || PyDict_SetItem(lines, child, line) < 0) {
+            Py_XDECREF(line);
+            return -1;
+        }
+    }
+    int failed = 1;
+    if (!PyObject_TypeCheck(line, LineType) || ((Line *)line)->places == NULL) {
+        PyErr_SetString(PyExc_TypeError, "the lines must be lines");
+    } else {
+        failed = line_up(((Line *)line)->places, &waiter->place, waiter, at, orders) < 0
+                 || (limit < INT64_MAX && line_up(self->parts[LIMITS], &waiter->limit, waiter, limit, orders) < 0);
+    }
+    Py_DECREF(line);
+    return failed ? -1 : 0;
+}
+
+/* The edge that a lookup waits for, borrowed, if newer samples are all that it lacks. NULL where Python has to look closer,
+ * perhaps with an error. */
+static const History *
+feed_edge(const Feed *self, const Parked *waiter, int64_t *at, int64_t *limit)
+{
+    PyObject *asked[3];
+    int overflow;
+    if (self->parts[PATHS] == NULL || !is_plain(waiter, asked) || !PyLong_CheckExact(asked[2])) {
+        return NULL;
+    }
+    *at = PyLong_AsLongLongAndOverflow(asked[2], &overflow);
+    const Chain *path = overflow || *at == INT64_MIN ? NULL : paths_find((Paths *)self->parts[PATHS], asked[0], asked[1]);
+    const History *edge = path == NULL || !path->alone ? NULL : lagging_edge(path, *at, limit);
+    if (edge == NULL || *limit == INT64_MAX) {
+        return edge;
+    }
+    int64_t passed;
+    PyObject *number = PyObject_GetAttr(self->parts[INDEX], passed_string);
+    const int failed = number == NULL || read_stamp(number, &passed) < 0;
+    Py_XDECREF(number);
+    return failed || *limit < passed ? NULL : edge;
+}
+
+/* Park a waiter if newer samples are all that its question lacks: 1. 0, and nothing is done, if Python has to look closer;
+ * -1 for an error, and then Python removes what is in the index. */
+static int
+feed_park(const Feed *self, Parked *waiter)
+{
+    int64_t at, limit;
+    const History *edge = feed_edge(self, waiter, &at, &limit);
+    if (edge == NULL) {
+        return PyErr_Occurred() ? -1 : 0;
+    }
+    PyObject *child = PyObject_GetAttr(OBJECT(edge), child_string);
+    const int failed = child == NULL || feed_line_up(self, waiter, child, at, limit) < 0;
+    Py_XDECREF(child);
+    return failed ? -1 : 1;
+}
+
+/* ask(target, source, at, turn): a lookup to be awaited: a turn of the loop first if `turn` is true. */
+static PyObject *
+feed_ask(Feed *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 4 || self->parts[KIND] == NULL || self->parts[BEGIN] == NULL) {
+        PyErr_SetString(PyExc_TypeError, "ask takes target, source, at and whether to take a turn, after kind and begin");
+        return NULL;
+    }
+    PyObject *question = PyTuple_Pack(3, args[0], args[1], args[2]);
+    Parked *made = question == NULL ? NULL : (Parked *)PyType_GenericAlloc((PyTypeObject *)self->parts[KIND], 0);
+    if (made == NULL) {
+        Py_XDECREF(question);
+        return NULL;
+    }
+    made->asked = question;
+    Py_INCREF(OBJECT(self));
+    made->feed = OBJECT(self);
+    made->step = args[3] == Py_True ? BEFORE_TURN : AFTER_TURN;
+    return OBJECT(made);
+}
+
+/* Ask, and begin to sleep if newer samples are all that is missing. The answer, or None; NULL if it sleeps, or for an
+ * error. */
+static PyObject *
+parked_ask(Parked *self, const Feed *feed)
+{
+    PyObject *asked[3];
+    int64_t at, limit;
+    if (feed->parts[PATHS] == NULL || feed->parts[BEGIN] == NULL || !is_plain(self, asked)) {
+        Py_RETURN_NONE;
+    }
+    PyObject *found = paths_answer((Paths *)feed->parts[PATHS], asked, 3);
+    if (found != Py_None || feed_edge(feed, self, &at, &limit) == NULL) {
+        if (PyErr_Occurred()) {
+            Py_CLEAR(found);
+        }
+        return found;
+    }
+    PyObject *sleeper = PyObject_CallFunctionObjArgs(feed->parts[BEGIN], OBJECT(self), self->turned ? Py_True : Py_False, NULL);
+    if (sleeper == NULL || sleeper == Py_None) {
+        Py_DECREF(found);
+        return sleeper;
+    }
+    const int parked = feed_park(feed, self);
+    if (parked > 0) {
+        PyObject *old = self->sleeper;
+        self->sleeper = sleeper;
+        Py_XDECREF(old);
+    } else {
+        Py_DECREF(sleeper);
+    }
+    if (parked != 0) {
+        Py_CLEAR(found);
+    }
+    return found;
+}
+
+/* One step of the wait. At its end the result is the answer, or None where Python has to go on. */
+static PySendResult
+parked_step(PyObject *itself, PyObject *value, PyObject **result)
+{
+    Parked *self = (Parked *)itself;
+    Feed *feed = (Feed *)self->feed;
+    *result = NULL;
+    if (self->step == BEFORE_TURN) {
+        self->step = AFTER_TURN;
+        self->turned = 1;
+        Py_INCREF(Py_None);
+        *result = Py_None;
+        return PYGEN_NEXT;
+    }
+    if (self->step == AFTER_TURN && feed != NULL) {
+        self->step = NOT_AWAITED;
+        *result = parked_ask(self, feed);
+        if (self->sleeper == NULL || *result != NULL) {
+            return *result == NULL ? PYGEN_ERROR : PYGEN_RETURN;
+        }
+        self->step = ASLEEP;
+        value = Py_None;
+    }
+    if (self->step != ASLEEP || self->sleeper == NULL) {
+        PyErr_SetString(PyExc_RuntimeError, "a lookup is awaited once");
+        return PYGEN_ERROR;
+    }
+    PyObject *sleeper = self->sleeper;
+    self->sleeper = NULL;
+    const PySendResult sent = PyIter_Send(sleeper, value, result);
+    if (sent == PYGEN_NEXT) {
+        self->sleeper = sleeper;
+        return sent;
+    }
+    Py_DECREF(sleeper);
+    self->step = NOT_AWAITED;
+    if (sent == PYGEN_RETURN) {
+        Paths *paths = (Paths *)feed->parts[PATHS];
+        PyObject *answer = paths != NULL && self->answer != NULL && self->version == paths->version ? self->answer : Py_None;
+        Py_INCREF(answer);
+        Py_DECREF(*result);
+        *result = answer;
+    }
+    return sent;
 }
 
 /* Whether the wake-ups of a batch are plain: only lookups that need a stamp wait for its frames, nobody watches them,
@@ -237,13 +626,12 @@ feed_pop(PyObject *lines, PyObject *child, Line *line, Py_ssize_t last)
 static void
 feed_answer(const Feed *self, Parked *waiter)
 {
-    PyObject *plain = waiter->plain;
-    if (plain == NULL || !PyTuple_CheckExact(plain) || PyTuple_Size(plain) != 3) {
+    PyObject *asked[3], *question = waiter->asked;
+    if (!is_plain(waiter, asked)) {
         return;
     }
     Paths *paths = (Paths *)self->parts[PATHS];
-    PyObject *asked[3] = {PyTuple_GetItem(plain, 0), PyTuple_GetItem(plain, 1), PyTuple_GetItem(plain, 2)};
-    Py_INCREF(plain);
+    Py_INCREF(question);
     PyObject *old = waiter->answer, *answer = paths_answer(paths, asked, 3);
     waiter->answer = answer;
     waiter->version = paths->version;
@@ -252,7 +640,7 @@ feed_answer(const Feed *self, Parked *waiter)
         PyErr_Clear();
     }
     Py_XDECREF(old);
-    Py_DECREF(plain);
+    Py_DECREF(question);
 }
 
 /* Wake the lookups that a sample at a stamp has unblocked, each with its answer if that is plain. After an error of
@@ -277,6 +665,9 @@ feed_wake(const Feed *self, PyObject *child, int64_t stamp, Trouble *trouble)
             break;
         }
         Parked *waiter = (Parked *)item;
+        if (drop_limit(self->parts[LIMITS], waiter) < 0) {
+            set_aside(trouble);
+        }
         if (waiter->elsewhere) {
             PyObject *done = PyObject_CallFunctionObjArgs(self->parts[FORGET], item, NULL);
             if (done == NULL) {
@@ -353,9 +744,37 @@ feed_insert(Feed *self, PyObject *batch)
 }
 
 static PyMethodDef feed_methods[] = {
+    {"ask", FAST(feed_ask), METH_FASTCALL,
+     PyDoc_STR("ask(target, source, at, turn): a lookup to be awaited; its result is None where Python has to go on.")},
     {"insert", (PyCFunction)feed_insert, METH_O,
      PyDoc_STR("insert(batch): store a batch and wake the lookups that it has unblocked, if all is plain; else do "
                "nothing.")},
+    {NULL}
+};
+
+static int
+feed_set_kind(Feed *self, PyObject *kind, void *Py_UNUSED(closure))
+{
+    if (kind == NULL || !PyType_Check(kind) || !PyType_IsSubtype((PyTypeObject *)kind, ParkedType)) {
+        PyErr_SetString(PyExc_TypeError, "kind must be a class of parked lookups");
+        return -1;
+    }
+    PyObject *old = self->parts[KIND];
+    Py_INCREF(kind);
+    self->parts[KIND] = kind;
+    Py_XDECREF(old);
+    return 0;
+}
+
+static PyGetSetDef feed_getset[] = {
+    {"kind", NULL, (setter)feed_set_kind, PyDoc_STR("The class of what `ask` gives."), NULL},
+    {NULL}
+};
+
+static PyMemberDef feed_members[] = {
+    {"begin", T_OBJECT, offsetof(Feed, parts[BEGIN]), 0,
+     PyDoc_STR("begin(waiter, turned): the iterator that sleeps until `wake` of the waiter is called; None to let Python go "
+               "on. `turned` says whether the waiter has taken a turn of the loop.")},
     {NULL}
 };
 
@@ -367,6 +786,8 @@ static PyType_Slot feed_slots[] = {
     {Py_tp_traverse, feed_traverse},
     {Py_tp_clear, feed_clear},
     {Py_tp_methods, feed_methods},
+    {Py_tp_members, feed_members},
+    {Py_tp_getset, feed_getset},
     {0, NULL}
 };
 

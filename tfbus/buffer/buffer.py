@@ -4,8 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Any, SupportsIndex, TypeVar
 
-import anyio.lowlevel
-
+from tfbus._aio.loops import checkpoint, on_asyncio
 from tfbus.buffer.lookups import LocalNames, Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
@@ -14,7 +13,7 @@ from tfbus.errors import ExtrapolationError, TransformLookupError
 from tfbus.frames import as_prefix, is_frame
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.registration import Registration
-from tfbus.stamps import LATEST, AtLike, as_at
+from tfbus.stamps import LATEST, AtLike, as_at, as_duration
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
@@ -124,6 +123,8 @@ class Buffer:
         self._forest = self._lookups.forest = forest
         self._paths = forest.paths if self._local_names is None else forest.local_paths()
         self._paths.now = self.bus.clock.now
+        plain = self._local_names is None and self._lookups.has_alarms and forest is self._share.live.forest
+        self._feed = self._lookups.feed if plain else None
 
     @property
     def tree(self) -> TransformTree:
@@ -249,9 +250,29 @@ class Buffer:
         TypeError
             If a stamp is a float, or `max_age` comes without a `LATEST`.
         """
-        policy = policy_of(tolerance, max_gap, extrapolate)
-        question = Question(target, source, as_at(at), as_at(source_at), fixed, max_age, policy)
-        return await self._lookups.lookup(self._on_bus(question), timeout)
+        waits_plainly = max_age is None and source_at is None and fixed is None and not tolerance
+        if self._feed is None or not waits_plainly or max_gap is not None or extrapolate is not None:
+            policy = policy_of(tolerance, max_gap, extrapolate)
+            question = Question(target, source, as_at(at), as_at(source_at), fixed, max_age, policy)
+            return await self._lookups.lookup(self._on_bus(question), timeout)
+        last_reset = self._share.live.last_reset
+        turn = on_asyncio()
+        wait = self._feed.ask(target, source, at, turn)
+        if timeout is not None:
+            wait.patience = as_duration(timeout, "timeout")
+        try:
+            if not turn:
+                await checkpoint()
+            found: TransformStamped | None = await wait
+            if found is None or self._share.live.last_reset is not last_reset:
+                wait.asked = Question(target, source, as_at(at))
+                return await self._lookups.go_on(wait, last_reset)
+        except BaseException:
+            self._lookups.end(wait)
+            raise
+        if wait.cancel_end is not None:
+            wait.cancel_end()
+        return found
 
     async def _lookup_among(self, questions: Sequence[Question]) -> None:
         """Wait until each question has had an answer; if waiting cannot help one of them, raise its error at once.
@@ -308,7 +329,7 @@ class Buffer:
         """
         question = question_of(data, target, as_at(at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
         if self._is_in_place(question):
-            await anyio.lowlevel.checkpoint()
+            await checkpoint()
             return data
         return do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
 
@@ -479,16 +500,15 @@ class Buffer:
 
     def pending(self) -> tuple[PendingLookup, ...]:
         """The lookups that wait now, and the watches without an answer, each with the error that blocks it."""
-        pending = self._share.pending()
-        return pending if self._local_names is None else tuple(map(self._local_names.pending, pending))
+        return tuple(self._pending(None))
 
     def describe(self) -> str:
         """The tree as text, with each edge's rate, age, span and authority, and some of the lookups that wait."""
         lines = [describe(self._edges(), self._clock.now())]
-        pending = self.pending()
-        lines += [f"waiting: {lookup}" for lookup in pending[:_DESCRIBED]]
-        if len(pending) > _DESCRIBED:
-            lines.append(f"waiting: {len(pending) - _DESCRIBED} more lookups, see pending()")
+        lines += [f"waiting: {lookup}" for lookup in self._pending(_DESCRIBED)]
+        more = len(self._share.waiters) - _DESCRIBED
+        if more > 0:
+            lines.append(f"waiting: {more} more lookups, see pending()")
         return "\n".join(lines)
 
     def on_close(self, callback: Callable[[], object]) -> Registration:
@@ -504,7 +524,8 @@ class Buffer:
 
     def __repr__(self) -> str:
         keep = "everything" if self.tree.keep is None else f"{self.tree.keep:g} s"
-        state = "closed" if self._share.end_reason is not None else f"{counted(len(self.pending()), 'lookup')} waiting"
+        waiting = counted(len(self._share.waiters), "lookup")
+        state = "closed" if self._share.end_reason is not None else f"{waiting} waiting"
         return f"<Buffer of {counted(len(self.tree.frames()), 'frame')}, keeps {keep}, {state}>"
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[Any, ...]:
@@ -513,6 +534,10 @@ class Buffer:
     def _repr_html_(self) -> str:
         """The tree as notebooks show it, with ages counted from the clock's now."""
         return to_html(self._edges(), self._clock.now()) + legend()
+
+    def _pending(self, most: int | None) -> Iterable[PendingLookup]:
+        pending = self._lookups.pending(most)
+        return pending if self._local_names is None else map(self._local_names.pending, pending)
 
     def _edges(self) -> list[Edge]:
         """The newest edges, with the names of this buffer."""

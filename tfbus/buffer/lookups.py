@@ -14,18 +14,16 @@ all others that have.
 import logging
 import math
 import sys
-from collections.abc import Awaitable, Callable, Generator, Hashable
+from asyncio import get_running_loop
+from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from heapq import heapify, heappop, heappush
-from itertools import count, islice
+from itertools import count
 from typing import Any, Protocol, cast
 
-import anyio
-import anyio.lowlevel
-import anyio.to_thread
-
+from tfbus._aio.loops import asleep, checkpoint, running_loop, wake_up
 from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import SeenKeys
 from tfbus.clock import Clock, SimulatedClock, SystemClock
@@ -44,13 +42,7 @@ from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_duration, from
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.history import Edge
 from tfbus.tree.lookup import Bounds, Question, answer
-from tfbus.waiting.live_tree import PendingLookup, Share, Waiter, blocking_frames, without_traceback
-
-
-def running_loop() -> Any:
-    """The running event loop: the loop object of asyncio, or the token of trio."""
-    # anyio has no public timer; only the loops' own functions set one without a task of the caller.
-    return cast(Any, anyio.lowlevel.current_token().native_token)
+from tfbus.waiting.live_tree import PendingLookup, Share, Waiter, without_traceback
 
 
 class LoopTimer:
@@ -108,56 +100,6 @@ class LoopTimer:
         self._fire()
 
 
-def wake_up() -> tuple[Awaitable[None], Callable[[], object]]:
-    """A wait of one task on the loop that runs now, to be awaited once, and the function that ends it.
-
-    If it was ended before the task awaits it, there is no checkpoint. The function may raise an `Exception` if the wait
-    has ended, or the event loop is closed.
-    """
-    loop = running_loop()
-    if hasattr(loop, "create_future"):
-        # No function of Python is then on the way from a publish to the event loop.
-        future = loop.create_future()
-        return future, partial(future.set_result, None)
-    woken = _TrioWakeUp()
-    return woken, woken.end
-
-
-class _TrioWakeUp:
-    """A wait of one task on trio."""
-
-    __slots__ = ("_ended", "_task")
-
-    def __init__(self) -> None:
-        self._task: Any = None
-        self._ended = False
-
-    def end(self) -> None:
-        """End the wait, if it has not ended."""
-        if not self._ended:
-            self._ended = True
-            task, self._task = self._task, None
-            if task is not None:
-                cast(Any, sys.modules["trio"]).lowlevel.reschedule(task)
-
-    def __await__(self) -> Generator[Any, None, None]:
-        if self._ended:
-            return _nothing()
-        lowlevel = cast(Any, sys.modules["trio"]).lowlevel
-        self._task = lowlevel.current_task()
-        return cast(Generator[Any, None, None], lowlevel.wait_task_rescheduled(self._abort).__await__())
-
-    def _abort(self, _raise_cancel: object) -> Any:
-        """End the wait, because trio has cancelled it."""
-        self._task = None
-        self._ended = True
-        return cast(Any, sys.modules["trio"]).lowlevel.Abort.SUCCEEDED
-
-
-def _nothing() -> Generator[Any, None, None]:
-    yield from ()
-
-
 class LocalNames:
     """Translates questions into the names of the bus, and answers into local names.
 
@@ -176,8 +118,8 @@ class LocalNames:
     def question(self, asked: Question) -> Question:
         """A question with the names of the bus."""
         fixed = None if asked.fixed is None else self._prefix.on_bus(asked.fixed)
-        return replace(
-            asked, target=self._prefix.on_bus(asked.target), source=self._prefix.on_bus(asked.source), fixed=fixed
+        return asked._replace(
+            target=self._prefix.on_bus(asked.target), source=self._prefix.on_bus(asked.source), fixed=fixed
         )
 
     def answer(self, found: TransformStamped) -> TransformStamped:
@@ -188,8 +130,8 @@ class LocalNames:
         """A waiting lookup with the local names of its question; its error keeps the names of the bus."""
         asked = found.question
         fixed = None if asked.fixed is None else self._prefix.local(asked.fixed)
-        asked = replace(
-            asked, target=self._prefix.local(asked.target), source=self._prefix.local(asked.source), fixed=fixed
+        asked = asked._replace(
+            target=self._prefix.local(asked.target), source=self._prefix.local(asked.source), fixed=fixed
         )
         return replace(found, question=asked)
 
@@ -217,6 +159,10 @@ _CANCELLED_KEPT = 64
 
 Cancel = Callable[[], object]
 """Cancels a call, if it has not been made."""
+
+
+def _nothing() -> None:
+    """Cancel nothing."""
 
 
 class Alarms(Protocol):
@@ -308,6 +254,7 @@ NAMED = 3
 """The number of lookups that a line names; naming one searches all frames for similar names."""
 
 _LOOKED_AT = 10_000
+_LEAST_PAUSE = 0.1
 
 
 class HangingReport:
@@ -317,96 +264,70 @@ class HangingReport:
     ----------
     share : Share
     clock : Clock
+    blocker : callable
+        Gives the error that blocks a waiter; None if it has found its answer.
     """
 
-    def __init__(self, share: Share, clock: Clock) -> None:
+    def __init__(self, share: Share, clock: Clock, blocker: Callable[[Waiter], TransformLookupError | None]) -> None:
         self._share = share
         self._clock = clock
+        self._blocker = blocker
         self._told = SeenKeys(_LOOKED_AT)
         self._last: int | None = None
 
-    def tell(self, question: Question, since: int, blocker: TransformLookupError) -> float:
-        """Log a lookup that has waited for `REPORT_AFTER`, and all others that have, unless a line was logged just now.
+    def tell(self) -> float:
+        """Log the lookups that have waited for `REPORT_AFTER`, unless a line was logged just now.
 
         Returns
         -------
         float
-            The time, in s, until the next call of this method; infinity if the cause has been logged.
+            The time, in s, until the next call of this method; infinity if no lookup waits whose cause is untold.
         """
-        if _cause(blocker) in self._told:
-            return math.inf
         now = self._clock.now()
         if self._last is not None and 0 <= now - self._last < from_seconds(REPORT_AFTER):
             return REPORT_AFTER - to_seconds(now - self._last)
+        named: list[PendingLookup] = []
+        unnamed = 0
+        first = math.inf
+        for waiter in self._share.waiters[:_LOOKED_AT]:
+            pause = REPORT_AFTER - to_seconds(now - waiter.since)
+            if waiter.patience <= REPORT_AFTER or waiter.cause in self._told:
+                continue
+            if pause > 0.0:
+                first = min(first, pause)
+            elif len(named) == NAMED:
+                unnamed += self._told.add(waiter.cause)
+            elif (blocker := self._blocker(waiter)) is not None:
+                self._told.add(waiter.cause)
+                named.append(PendingLookup(waiter.question, waiter.since, blocker))
+        if not named:
+            return max(first, _LEAST_PAUSE)
         self._last = now
-        self._told.add(_cause(blocker))
-        named = [PendingLookup(question, since, blocker)]
-        untold = 0
-        long = (each for each in self._share.pending() if each.since <= now - from_seconds(REPORT_AFTER))
-        for pending in islice(long, _LOOKED_AT):
-            if self._told.add(_cause(pending.blocked_by)):
-                if len(named) < NAMED:
-                    named.append(pending)
-                else:
-                    untold += 1
         log = logging.getLogger("tfbus")
         if len(named) == 1:
+            question = named[0].question
             log.warning(
                 "a lookup of %r in %r has waited for more than %g s: %s",
                 question.source,
                 question.target,
                 REPORT_AFTER,
-                blocker,
+                named[0].blocked_by,
             )
         else:
             lookups = "; ".join(map(str, named))
-            more = f"; and {untold} more, see Buffer.pending()" if untold else ""
+            more = f"; and {unnamed} more, see Buffer.pending()" if unnamed else ""
             log.warning(
-                "%d lookups have waited for more than %g s: %s%s", len(named) + untold, REPORT_AFTER, lookups, more
+                "%d lookups have waited for more than %g s: %s%s", len(named) + unnamed, REPORT_AFTER, lookups, more
             )
-        return math.inf
+        return max(first, REPORT_AFTER)
 
 
-def _cause(blocker: TransformLookupError) -> Hashable:
-    return type(blocker), blocking_frames(blocker)
-
-
-class _Wait:
+class Wait(Waiter):
     """A lookup that waits, from its first error to its end."""
 
-    __slots__ = (
-        "blocker",
-        "cancel_end",
-        "cancel_reminder",
-        "expired",
-        "is_long",
-        "last_reset",
-        "others",
-        "question",
-        "since",
-        "wake",
-        "woken",
-    )
-    woken: Awaitable[None]
-    wake: Callable[[], object]
-
-    def __init__(
-        self,
-        question: Question,
-        since: int,
-        last_reset: ClockResetError | None,
-        blocker: TransformLookupError,
-        others: tuple[Question, ...],
-    ) -> None:
-        self.question = question
-        self.since = since
-        self.last_reset = last_reset
-        self.blocker = blocker
-        self.others = others
-        self.cancel_end: Cancel | None = None
-        self.cancel_reminder: Cancel | None = None
-        self.expired = False
-        self.is_long = False
+    sleep: Generator[Any, None, None]
+    expired = False
+    cancel_end: Cancel | None = None
 
     def expire(self) -> None:
         """End the wait."""
@@ -432,6 +353,8 @@ class Lookups:
     ----------
     forest : Forest
         The forest that answers.
+    feed : Feed or None
+        Asks for this buffer, and parks its lookups; only the compiled kernel has one.
     """
 
     def __init__(
@@ -444,9 +367,22 @@ class Lookups:
         self.forest = share.live.forest
         self.bus = bus
         self._clock = bus.clock
+        self._now = bus.clock.now
+        self._is_here = bus._is_here
         self._local_names = local_names
-        self._report = HangingReport(share, bus.clock)
         self._alarms = alarms_of(bus.clock)
+        self._report = HangingReport(share, bus.clock, self.blocker)
+        # The loop on which the next look at the lookups that hang is due, if one is, and the function that cancels it.
+        self._looking_on: Any = None
+        self._cancel_look: Cancel = _nothing
+        self.feed = share.live.make_feed()
+        if self.feed is not None:
+            self.feed.kind, self.feed.begin = Wait, self.begin
+
+    @property
+    def has_alarms(self) -> bool:
+        """Whether a wait needs no cancel scopes."""
+        return self._alarms is not None
 
     def bounds(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> Bounds | None:
         """The stamps that count as `LATEST` now; None for any."""
@@ -495,131 +431,170 @@ class Lookups:
 
         `others` are further questions that need an answer: if waiting cannot help one of them, its error is raised.
         """
-        limit = math.inf if timeout is None else as_duration(timeout, "timeout")
+        wait = Wait(question, 0, _nothing)
+        wait.share, wait.others = self.share, others
+        if timeout is not None:
+            wait.patience = as_duration(timeout, "timeout")
         last_reset = self.share.live.last_reset
-        await anyio.lowlevel.checkpoint()
-        try:
-            return self._lookup_since(last_reset, question)
-        except MAY_COME as error:
-            if isinstance(error, UnknownFrameError):
-                self._check_names(question)
-            blocker = without_traceback(error)
-        self.bus._check_thread()
-        wait = _Wait(question, self._clock.now(), last_reset, blocker, others)
-        alarms = self._alarms
-        if alarms is None:
-            found = await self._wait_in_scopes(wait, limit)
-            if found is not None:
-                return found
-            raise _timed_out(wait, limit) from wait.blocker
-        # Inline, because every further coroutine would be resumed one by one.
-        self._set_alarms(wait, limit, alarms)
+        await checkpoint()
+        return await self.go_on(wait, last_reset)
+
+    async def go_on(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:
+        """As `lookup`, for a task that has passed the checkpoint, and may have been woken.
+
+        Every jump back of the clock after `last_reset` ends it.
+        """
+        wait.since = wait.since or self._clock.now()
+        if self._alarms is None:
+            return await self._wait_in_scopes(wait, last_reset)
         waiting, paths = self.share.live.waiting, self.forest.paths
         try:
             while True:
-                waiter = self._park(wait)
-                try:
-                    # Timeouts of zero give the others a turn as well.
-                    await (anyio.lowlevel.checkpoint() if wait.expired else wait.woken)
-                except BaseException:
-                    waiting.remove(waiter)
-                    raise
-                found = waiter.answer
-                if found is not None and waiter.version == paths.version:
-                    # Nothing has changed since the insertion woke and removed the waiter.
-                    return found if self._local_names is None else self._local_names.answer(found)
-                waiting.remove(waiter)
-                found = self._ask_again(wait)
+                waiting.remove(wait)
+                if wait.expired:
+                    return self._last_answer(wait, last_reset)
+                found = self._ask(wait, last_reset)
                 if found is not None:
                     return found
-                if wait.expired:
-                    raise _timed_out(wait, limit) from wait.blocker
-                if wait.is_long:
-                    self._remind(wait, alarms)
+                # Timeouts of zero give the others a turn as well.
+                await (checkpoint() if wait.expired else asleep(wait.sleep))
+                found = wait.answer
+                if found is not None and wait.version == paths.version:
+                    # Nothing has changed since the insertion woke and removed the waiter.
+                    return found if self._local_names is None else self._local_names.answer(found)
         finally:
-            if wait.cancel_end is not None:
-                wait.cancel_end()
-            if wait.cancel_reminder is not None:
-                wait.cancel_reminder()
+            self.end(wait)
 
-    def report(self, question: Question, since: int, blocker: TransformLookupError) -> float:
-        """Log a lookup that has waited for long; return the time, in s, after which to call this again."""
-        return self._report.tell(question, since, blocker)
+    def begin(self, wait: Wait, on_asyncio: bool) -> Generator[Any, None, None] | None:
+        """The sleep of a lookup that the kernel is about to park; None if it must not. Called by the kernel."""
+        if self.share.end_reason is not None or wait.patience == 0.0:
+            return None
+        wait.share = self.share
+        if on_asyncio:
+            # As `wake_up`, which takes twice as long to call.
+            loop = get_running_loop()
+            future = loop.create_future()
+            wait.wake = partial(future.set_result, None)
+            sleep = future.__await__()
+        else:
+            loop = running_loop()
+            sleep, wait.wake = wake_up(loop)
+        wait.since = self._now()
+        if self._looking_on is not loop:
+            # Else this thread has been checked.
+            if not self._is_here():
+                return None
+            self._look_after(REPORT_AFTER)
+        if wait.patience < math.inf:
+            self._set_end(wait)
+        return sleep
 
-    def _set_alarms(self, wait: "_Wait", limit: float, alarms: Alarms) -> None:
-        """Set the alarms for the end of a wait, after some time (s), and for the log line before it."""
-        if limit == 0.0:
-            wait.expired = True
-        elif limit < math.inf:
-            wait.cancel_end = alarms.call_after(limit, wait.expire)
-        if limit > REPORT_AFTER:
-            wait.cancel_reminder = alarms.call_after(REPORT_AFTER, partial(self._remind, wait, alarms))
+    def end(self, wait: Wait) -> None:
+        """Leave nothing of a wait behind."""
+        self.share.live.waiting.remove(wait)
+        if wait.cancel_end is not None:
+            wait.cancel_end()
 
-    def _park(self, wait: "_Wait") -> Waiter:
-        """Park a lookup under the frames that block it, with a new wake-up."""
-        share = self.share
-        if share.end_reason is not None:
-            raise BusClosedError(share.end_reason) from wait.blocker
-        wait.woken, wait.wake = wake_up()
-        waiter = Waiter(wait.question, wait.since, wait.wake, wait.others)
-        share.park(waiter, wait.blocker)
-        return waiter
+    def pending(self, most: int | None = None) -> Iterator[PendingLookup]:
+        """All waiting lookups, or the first few, with the errors that block them. For any thread."""
+        for waiter in self.share.waiters[:most]:
+            if (blocker := self.blocker(waiter)) is not None:
+                yield PendingLookup(waiter.question, waiter.since, blocker)
 
-    def _ask_again(self, wait: "_Wait") -> TransformStamped | None:
-        """The answer; or None, after noting the error that blocks it."""
+    def blocker(self, waiter: Waiter) -> TransformLookupError | None:
+        """The error that blocks a parked waiter now; None if it has found its answer. For any thread."""
         try:
-            # The data may have come in the turn of the loop in which the time ran out.
-            return self._lookup_since(wait.last_reset, wait.question)
+            self.lookup_nowait(waiter.question)
+        except TransformLookupError as error:
+            return without_traceback(error)
+        return waiter.blocked_by
+
+    def report(self) -> float:
+        """Log the lookups that have waited for long; return the time, in s, after which to call this again."""
+        return self._report.tell()
+
+    def _ask(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped | None:
+        """The answer; or None, after parking the lookup under the frames that block it, with a new wake-up."""
+        found = self._look(wait, last_reset)
+        if found is None and wait.blocked_by is not None:
+            self.bus._check_thread()
+            if self.share.end_reason is not None:
+                raise BusClosedError(self.share.end_reason) from wait.blocked_by
+            wait.sleep = self._fall_asleep(wait)
+            self.share.park(wait, wait.blocked_by)
+        return found
+
+    def _look(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped | None:
+        """The answer; or None, after noting the error that blocks it."""
+        latest = self.share.live.last_reset
+        if latest is not None and latest is not last_reset:
+            raise ClockResetError(before=latest.before, after=latest.after)
+        try:
+            return self.lookup_nowait(wait.question)
         except MAY_COME as error:
-            wait.blocker = without_traceback(error)
+            if isinstance(error, UnknownFrameError):
+                self._check_names(wait.question)
+            wait.blocked_by = without_traceback(error)
         for other in wait.others:
             with suppress(*MAY_COME):
                 self.lookup_nowait(other)
         return None
 
-    def _remind(self, wait: "_Wait", alarms: Alarms) -> None:
-        """Log a lookup that has waited for long, now or when the next line may be logged."""
-        wait.is_long = True
-        pause = self.report(wait.question, wait.since, wait.blocker)
-        if pause < math.inf:
-            if wait.cancel_reminder is not None:
-                wait.cancel_reminder()
-            wait.cancel_reminder = alarms.call_after(pause, partial(self._remind, wait, alarms))
+    def _last_answer(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:
+        """The answer of a wait whose time is up: the data may have come in the same turn of the loop."""
+        found = self._look(wait, last_reset)
+        if found is not None:
+            return found
+        target, source, *_ = wait.question
+        missing = cast(TransformLookupError, wait.blocked_by)
+        raise LookupTimeoutError(target=target, source=source, timeout=wait.patience, missing=missing) from missing
 
-    async def _wait_in_scopes(self, wait: "_Wait", limit: float) -> TransformStamped | None:
-        """Wait for the answer for some time (s) by a clock that knows no alarms; None if there was none."""
+    def _fall_asleep(self, wait: Wait) -> Generator[Any, None, None]:
+        """The sleep of a lookup, with a new wake-up. Its alarms are set the first time."""
+        loop = running_loop()
+        sleep, wait.wake = wake_up(loop)
+        if self._looking_on is not loop and self._alarms is not None:
+            self._look_after(max(REPORT_AFTER - to_seconds(self._now() - wait.since), 0.0))
+        self._set_end(wait)
+        return sleep
+
+    def _set_end(self, wait: Wait) -> None:
+        """Set the alarm for the end of a wait, if it has an end and no alarm."""
+        if wait.patience < math.inf and wait.cancel_end is None and self._alarms is not None:
+            if wait.patience == 0.0:
+                wait.expired = True
+            else:
+                wait.cancel_end = self._alarms.call_after(wait.patience, wait.expire)
+
+    def _look_after(self, pause: float) -> None:
+        """Look at the lookups that hang after some time (s), unless that is infinite."""
+        self._cancel_look()
+        if pause < math.inf and self._alarms is not None:
+            self._looking_on = running_loop()
+            self._cancel_look = self._alarms.call_after(pause, lambda: self._look_after(self.report()))
+        else:
+            self._looking_on, self._cancel_look = None, _nothing
+
+    async def _wait_in_scopes(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:
+        """Wait for the answer by a clock that knows no alarms."""
+        found = self._ask(wait, last_reset)
         pause = REPORT_AFTER
-        found = None
-        with self._clock.move_on_after(limit):
+        with self._clock.move_on_after(wait.patience):
             while found is None:
                 with self._clock.move_on_after(pause):
                     while found is None:
-                        waiter = self._park(wait)
                         try:
-                            await wait.woken
+                            await asleep(wait.sleep)
                         finally:
-                            self.share.live.waiting.remove(waiter)
-                        found = self._ask_again(wait)
+                            self.share.live.waiting.remove(wait)
+                        found = self._ask(wait, last_reset)
                 if found is None:
-                    pause = min(self.report(wait.question, wait.since, wait.blocker), REPORT_AFTER)
-                    found = self._ask_again(wait)
-        return self._ask_again(wait) if found is None else found
-
-    def _lookup_since(self, last_reset: ClockResetError | None, question: Question) -> TransformStamped:
-        """The answer, or `ClockResetError` if the clock has jumped back after `last_reset`."""
-        latest = self.share.live.last_reset
-        if latest is not None and latest is not last_reset:
-            raise ClockResetError(before=latest.before, after=latest.after)
-        return self.lookup_nowait(question)
+                    found = self._ask(wait, last_reset)
+                    pause = min(self.report(), REPORT_AFTER)
+        return self._last_answer(wait, last_reset) if found is None else found
 
     def _check_names(self, question: Question) -> None:
         """Raise `UnknownFrameError` for a name that can never be the name of a frame."""
         for name in (question.target, question.source, question.fixed):
             if name is not None and not is_frame(name):
                 raise UnknownFrameError(frame=name, known=self.forest.some_frames()) from None
-
-
-def _timed_out(wait: _Wait, limit: float) -> LookupTimeoutError:
-    """The error of a wait that had no answer for some time (s)."""
-    question = wait.question
-    return LookupTimeoutError(target=question.target, source=question.source, timeout=limit, missing=wait.blocker)

@@ -176,7 +176,7 @@ class Watch:
         try:
             pause = REPORT_AFTER - to_seconds(self._clock.now() - since)
             while pause <= 0.0 or not await self._wait(pause):
-                pause = self._lookups.report(self._question, since, blocker)
+                pause = self._lookups.report()
         finally:
             self._lookups.share.live.waiting.remove(waiter)
 

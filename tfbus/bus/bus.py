@@ -70,12 +70,16 @@ class OwnerThread:
         self.entered: WeakSet[object] = WeakSet()
         _OWNERS.add(self)
 
+    def is_here(self) -> bool:
+        """Whether this thread owns the bus, and has run an event loop with it."""
+        return get_ident() == self.thread and self._on_a_loop
+
     def check(self) -> None:
         """Raise `RuntimeError` unless this thread owns the bus, or runs an event loop and may take it over."""
-        thread = get_ident()
-        if thread == self.thread and self._on_a_loop:
+        if self.is_here():
             return
         self.check_process()
+        thread = get_ident()
         on_a_loop = _runs_a_loop()
         if thread != self.thread:
             if self._on_a_loop or not on_a_loop:
@@ -212,10 +216,13 @@ class Bus:
         self._intake: Any = None
         self._take: Callable[[object, object], bool | None] = _take_nothing
         if Intake is not None:
-            listeners = self._subscribers.callbacks, self._streams, self._events, self._late
-            self._intake = Intake(self._topology.judge, TransformStamped, listeners)
+            listeners = self._subscribers.callbacks, self._streams, self._events
+            busy = self._subscribers.calling, self._late
+            self._intake = Intake(self._topology.judge, TransformStamped, self._tell, listeners, busy)
             self._take = self._intake.take
         self._owner = OwnerThread(self._intake)
+        # Whether this thread owns the bus, and has run an event loop with it. Called by buffers.
+        self._is_here = self._owner.is_here
         self._resets = 0
         self._removals = 0
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
@@ -271,7 +278,7 @@ class Bus:
             If this is not the bus's thread, or this process was forked and has the bus without its links; if
             subscribers that publish have queued more than 1,000 batches.
         """
-        # The usual case: samples only continue known edges, and nobody but the buffers gets them.
+        # The usual case: samples only continue known edges.
         taken = self._take(samples, invalid)
         if taken:
             return
@@ -287,21 +294,13 @@ class Bus:
             batch = as_batch(samples)
         else:
             batch = self._well_typed(samples)
-        callbacks = self._subscribers.callbacks
-        if callbacks:
-            self._subscribers.check_backlog()
+        self._subscribers.check_backlog()
         batch = self._topology.accept(batch, invalid, judged=taken is None)
         if not batch:
             return
         self._published += len(batch)
         error = self._insert(batch)
-        for stream in self._streams:
-            stream.put(batch)
-        if self._events:
-            for events in self._events:
-                events.arrived(batch)
-        if callbacks:
-            self._subscribers.deliver(batch)
+        self._tell(batch)
         if error is not None:
             raise error
 
@@ -667,6 +666,15 @@ class Bus:
             except BaseException as error:  # noqa: BLE001 - it is raised after all have the batch
                 first = first or error
         return first
+
+    def _tell(self, batch: Batch) -> None:
+        """Give an accepted batch to everybody but the buffers."""
+        for stream in self._streams:
+            stream.put(batch)
+        for events in self._events:
+            events.arrived(batch)
+        if self._subscribers.callbacks:
+            self._subscribers.deliver(batch)
 
     def _remove_if_known(self, frame: str) -> None:
         with suppress(UnknownFrameError):

@@ -73,8 +73,20 @@ class SampleQueue:
             The instant of its publication in ns; only subclasses read it.
         """
         if self.overflow == "conflate":
+            newest = self._newest
             for sample in batch:
-                self._conflate(sample)
+                _, child, stamp, _, _, static = sample._fields
+                pending = newest.get(child)
+                if pending is None:
+                    self._moving += not static
+                else:
+                    self.conflated += not pending.static
+                    # The last kind wins; among moving samples, the newest stamp wins.
+                    if not (static or pending.static) and stamp < pending.stamp:
+                        continue
+                    del newest[child]
+                    self._moving += pending.static - static
+                newest[child] = sample
             if self._moving > self.capacity:
                 self._drop_children()
         else:
@@ -119,18 +131,6 @@ class SampleQueue:
     def statistics(self, kind: str) -> QueueStatistics:
         """The queue's counters; `kind` is its purpose."""
         return QueueStatistics(kind, self.overflow, self.capacity, len(self), self.dropped, self.conflated)
-
-    def _conflate(self, sample: TransformStamped) -> None:
-        pending = self._newest.get(sample.child)
-        if pending is not None:
-            self.conflated += not pending.static
-            # The last kind wins; among moving samples, the newest stamp wins.
-            if not (sample.static or pending.static) and sample.stamp < pending.stamp:
-                return
-            del self._newest[sample.child]
-            self._moving -= not pending.static
-        self._newest[sample.child] = sample
-        self._moving += not sample.static
 
     def _drop_children(self) -> None:
         for child in [child for child, sample in self._newest.items() if not sample.static]:

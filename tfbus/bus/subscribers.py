@@ -153,6 +153,8 @@ class Subscribers:
     Attributes
     ----------
     callbacks : dict of int to callable
+    calling : list of callable
+        The callbacks that run now, each called by the one before it.
     failures : int
         Number of exceptions that subscribers raised.
     """
@@ -165,7 +167,7 @@ class Subscribers:
         self._keys = count()
         self._backlog: deque[Batch] = deque()
         self._current: Batch = ()
-        self._calling: Callable[..., object] | None = None
+        self.calling: list[Callable[..., object]] = []
         self._queued = 0
         self.failures = 0
 
@@ -181,30 +183,25 @@ class Subscribers:
         if removed is not None:
             self._removal_callbacks[key] = removed
         if latched:
-            outer, self._calling = self._calling, callback
-            try:
-                self._call(key, callback, latched)
-            finally:
-                self._calling = outer
-            if outer is None:
-                self._deliver_backlog()
+            self._call(key, callback, latched)
+            self._deliver_backlog()
         return Registration(lambda: self._remove(key))
 
     def check_backlog(self) -> None:
         """Raise `RuntimeError` if callbacks publish without end."""
         if self._queued >= _QUEUED_BATCHES:
             raise RuntimeError(
-                f"the subscriber {_name(self._calling)} publishes without end: {self._queued} batches are queued "
+                f"the subscriber {_name(self.calling[-1])} publishes without end: {self._queued} batches are queued "
                 "behind the one that it was called with"
             )
 
     def deliver(self, batch: Batch) -> None:
         """Call every subscriber with a batch: now or, inside a callback, after the batches before it."""
         self._backlog.append(batch)
-        if self._calling is not None:
+        if self.calling:
             self._queued += 1
-            return
-        self._deliver_backlog()
+        else:
+            self._deliver_backlog()
 
     def discard_moving(self) -> None:
         """Take the moving samples out of the batches that are not delivered yet: the clock has jumped back."""
@@ -216,16 +213,10 @@ class Subscribers:
 
     def notify_removed(self, child: str) -> None:
         """Call the removal callbacks with a frame; batches that they publish are delivered afterwards."""
-        outer = self._calling
-        try:
-            for key, removed in tuple(self._removal_callbacks.items()):
-                if key in self._removal_callbacks:
-                    self._calling = removed
-                    self._call(key, removed, child)
-        finally:
-            self._calling = outer
-        if outer is None:
-            self._deliver_backlog()
+        for key, removed in tuple(self._removal_callbacks.items()):
+            if key in self._removal_callbacks:
+                self._call(key, removed, child)
+        self._deliver_backlog()
 
     def _keep_only(self, wanted: Callable[[TransformStamped], bool]) -> None:
         self._current = tuple(filter(wanted, self._current))
@@ -233,17 +224,19 @@ class Subscribers:
         self._backlog = deque(batch for batch in batches if batch)
 
     def _deliver_backlog(self) -> None:
+        """Deliver all batches, unless a callback runs: then its caller delivers them."""
+        if self.calling:
+            return
         try:
             while self._backlog:
                 self._current = self._backlog.popleft()
                 for key in tuple(self.callbacks):
                     # A callback may have closed another registration, or removed a frame of the batch.
-                    if self._current and key in self.callbacks:
-                        self._calling = self.callbacks[key]
-                        self._call(key, self._calling, self._current)
+                    callback = self.callbacks.get(key)
+                    if callback is not None and self._current:
+                        self._call(key, callback, self._current)
         finally:
             self._current = ()
-            self._calling = None
             self._queued = 0
 
     def _remove(self, key: int) -> None:
@@ -251,6 +244,7 @@ class Subscribers:
         self._removal_callbacks.pop(key, None)
 
     def _call(self, key: int, callback: Callable[[GivenT], object], given: GivenT) -> None:
+        self.calling.append(callback)
         try:
             callback(given)
         except Exception as error:  # noqa: BLE001 - a subscriber must not stop the publisher
@@ -258,7 +252,9 @@ class Subscribers:
             self._log.warning(("subscriber", key), "the subscriber %s raised", _name(callback), exc_info=error)
             if self._announcer.has_listeners:
                 self._announcer.announce(SubscriberFailed(self._announcer.now(), _name(callback), error))
+        finally:
+            self.calling.pop()
 
 
-def _name(callback: Callable[..., object] | None) -> str:
+def _name(callback: Callable[..., object]) -> str:
     return getattr(callback, "__qualname__", None) or repr(callback)

@@ -444,9 +444,14 @@ class DomainEnd(Endpoint):
                 self.reject(peer.id, "too many frames", error)
                 continue
             # A late live sample of a moving frame belongs to its history; the relay knows which samples came before.
-            if is_new or (live and not static and _moves(replica.entries[child])):
+            if is_new or (live and not static and self._shows_moving(replica.entries[child])):
                 kept.append(sample)
         return kept
+
+    def _shows_moving(self, entry: Entry) -> bool:
+        """Whether the bus shows the frame of an entry, and it moves."""
+        is_shown = not self.drop_lost or self.relay.reaches(entry.origin)
+        return is_shown and entry.sample is not None and not entry.sample.static
 
     def _wanted(self, samples: list[ReceivedTransform]) -> list[ReceivedTransform]:
         frames = self.frames
@@ -685,7 +690,3 @@ class _Due(NamedTuple):
 
     kind: Kind
     data: bytes
-
-
-def _moves(entry: Entry) -> bool:
-    return entry.sample is not None and not entry.sample.static

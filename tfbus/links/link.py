@@ -221,7 +221,8 @@ class Link:
     OSError
         On entering, if there is no connection.
     BusClosedError, RuntimeError
-        On entering, if the bus is closed; if it belongs to another thread, or the link was entered before.
+        On entering, if the bus is closed; if it belongs to another thread, another link of it was entered in another
+        event loop, or the link was entered before.
     """
 
     def __init__(
@@ -292,6 +293,9 @@ class Link:
         self.bus._check_thread()
         if self.bus.closed:
             raise BusClosedError
+        for other in self.bus._entered:
+            if isinstance(other, Link):
+                other._check_loop()
         self._entered = True
         self._never_entered.detach()
         for waker in (self._received, self._turn_ends):
@@ -490,7 +494,8 @@ class DomainLink(Link):
     OSError
         On entering, if there is no network.
     BusClosedError, RuntimeError
-        On entering, if the bus is closed; if it belongs to another thread, or the link was entered before.
+        On entering, if the bus is closed; if it belongs to another thread, another link of it was entered in another
+        event loop, or the link was entered before.
 
     Notes
     -----

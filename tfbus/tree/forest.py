@@ -30,7 +30,7 @@ from tfbus.errors import (
     UnknownFrameError,
     error_of,
 )
-from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.geometry.stamped import Batch, QualifiedTransform, TransformStamped
 from tfbus.rows import IDENTITY, Row, compose, invert
 from tfbus.stamps import LATEST, STAMP_MIN, Latest, as_stamp
 from tfbus.tree.cycles import Frames, Loop, admit, edges_above, names_below, past_loop
@@ -190,11 +190,12 @@ class Path(Chain):
             If an edge does not cover it.
         """
         row = self.row(at)
-        if row is None:
-            row = _climb(self.up, at)
-            if self.down:
-                row = compose(invert(_climb(self.down, at)), row)
-        return row
+        return self.product(lambda edge: edge.row_at(at)) if row is None else row
+
+    def product(self, row_of: Callable[[FrameHistory], Row]) -> Row:
+        """The row of source in target by the row of each moving edge, step by step."""
+        row = _climb(self.up, row_of)
+        return compose(invert(_climb(self.down, row_of)), row) if self.down else row
 
     def newest_common(self) -> tuple[int, FrameHistory]:
         """The newest stamp that every moving edge has reached, and the edge that lags most.
@@ -235,11 +236,11 @@ class Path(Chain):
         return error
 
 
-def _climb(steps: tuple[Step, ...], at: int) -> Row:
-    """The first step's child, seen from the last step's parent, at a stamp."""
+def _climb(steps: tuple[Step, ...], row_of: Callable[[FrameHistory], Row]) -> Row:
+    """The first step's child, seen from the last step's parent."""
     row: Row | None = None
     for step in steps:
-        here = step.row_at(at) if isinstance(step, FrameHistory) else step
+        here = row_of(step) if isinstance(step, FrameHistory) else step
         row = here if row is None else compose(here, row)
     return IDENTITY if row is None else row
 
@@ -417,6 +418,7 @@ class PathCache(Paths):
 
     def __init__(self, lock: AbstractContextManager[Any]) -> None:
         super().__init__(lock, LATEST, TransformStamped)
+        self.qualified = QualifiedTransform
         self._count = 0
         self._older: dict[str, dict[str, Path]] = {}
 

@@ -5,9 +5,8 @@ extrapolates nothing, and interpolates between any two samples, however far apar
 """
 
 import math
-from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from tfbus.errors import (
     TransformLookupError,
 )
 from tfbus.geometry.stamped import TransformStamped, answer_of, qualified_answer
-from tfbus.rows import IDENTITY, Row, compose, invert
+from tfbus.rows import Row, compose
 from tfbus.stamps import (
     LATEST,
     STAMP_MAX,
@@ -36,7 +35,7 @@ from tfbus.stamps import (
     as_stamp,
     from_seconds,
 )
-from tfbus.tree.forest import Forest, Path, Step
+from tfbus.tree.forest import Forest, Path
 from tfbus.tree.history import FrameHistory, Samples
 
 
@@ -53,9 +52,10 @@ class Hold:
     """
 
     max_age: float
+    _nanoseconds: int = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        as_duration(self.max_age, "max_age")
+        object.__setattr__(self, "_nanoseconds", _nanoseconds(self.max_age, "max_age"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ def policy_of(tolerance: float, max_gap: float | None, extrapolate: Hold | None)
     return Policy(
         _nanoseconds(tolerance, "tolerance"),
         None if max_gap is None else _nanoseconds(max_gap, "max_gap"),
-        0 if extrapolate is None else _nanoseconds(extrapolate.max_age, "max_age"),
+        0 if extrapolate is None else extrapolate._nanoseconds,
     )
 
 
@@ -106,8 +106,7 @@ def _nanoseconds(seconds: float, name: str) -> int:
     return STAMP_MAX if duration == math.inf else from_seconds(duration)
 
 
-@dataclass(frozen=True, slots=True)
-class Question:
+class Question(NamedTuple):
     """The arguments of a lookup: stamps in ns, `max_age` in s."""
 
     target: str
@@ -273,16 +272,7 @@ class Extrapolation:
             self.extrapolated_by = max(self.extrapolated_by, found.extrapolated_by)
             self.gap = max(self.gap, found.gap)
         ahead = iter(stamps)
-        up = _climb(path.up, ahead)
-        return up if not path.down else compose(invert(_climb(path.down, ahead)), up)
-
-
-def _climb(steps: tuple[Step, ...], stamps: Iterator[ReadStamp]) -> Row:
-    row = IDENTITY
-    for step in steps:
-        here = step.row_at(next(stamps).stamp) if isinstance(step, FrameHistory) else step
-        row = compose(here, row)
-    return row
+        return path.product(lambda edge: edge.row_at(next(ahead).stamp))
 
 
 At = int | Latest

@@ -27,8 +27,9 @@ wake a waiter is to call the function that it brought along: nothing here knows 
 """
 
 import logging
+import math
 from bisect import bisect_left, insort
-from collections.abc import Callable, Iterable, KeysView
+from collections.abc import Callable, Container, Hashable, Iterable, KeysView
 from dataclasses import dataclass
 from itertools import count, takewhile
 from operator import sub
@@ -60,7 +61,7 @@ from tfbus.which_kernel import Feed, Line, Parked
 Limits = list[tuple[str, int]]
 
 
-def limits_of(forest: Forest, question: Question, blocking: str | None) -> Limits:
+def limits_of(forest: Forest, question: Question, blocking: Container[str]) -> Limits:
     """The moving edges of a question, each with a limit in ns: a sample newer than it may make an answer impossible.
 
     An edge that keeps all samples has no limit. Neither has a lookup at `LATEST`, because its stamp is never too old.
@@ -70,8 +71,8 @@ def limits_of(forest: Forest, question: Question, blocking: str | None) -> Limit
     ----------
     forest : Forest
     question : Question
-    blocking : str or None
-        An edge to leave out, because each of its samples is noticed anyway.
+    blocking : container of str
+        The edges to leave out, because each of their samples is noticed anyway.
     """
     target, source, fixed = question.target, question.source, question.fixed
     if fixed is None:
@@ -83,7 +84,7 @@ def limits_of(forest: Forest, question: Question, blocking: str | None) -> Limit
 
 
 def _limits_at(
-    forest: Forest, target: str, source: str, at: int | Latest | None, policy: Policy | None, blocking: str | None
+    forest: Forest, target: str, source: str, at: int | Latest | None, policy: Policy | None, blocking: Container[str]
 ) -> Limits:
     if at is None or isinstance(at, Latest):
         return []
@@ -95,7 +96,7 @@ def _limits_at(
     if policy is not None:
         at = min(at + policy.tolerance, STAMP_MAX)
     for edge in edges:
-        if edge.child == blocking:
+        if edge.child in blocking:
             continue
         before, after = edge.around(at)
         if before is None:
@@ -157,58 +158,40 @@ class PendingLookup:
 class Waiter(Parked):
     """A parked lookup.
 
-    Parameters
-    ----------
-    question : Question
-    since : int
-        The stamp at which the lookup began to wait, in ns.
-    wake : callable
-        Called once, after the waiter was popped from the index.
-    others : tuple of Question
-        Further questions that need an answer: the waiter is woken when one of them can no longer have an answer.
-
     Attributes
     ----------
-    answer : TransformStamped or None
-        The plain answer that the insertion found when it woke the lookup, if there was one.
-    version : int
-        The version of the forest that gave this answer.
+    others : tuple of Question
+        Further questions that need an answer: the waiter is woken when one of them can no longer have an answer.
     share : Share or None
         The share of the buffer that asks.
+    patience : float
+        How long it waits at most, in s.
+    blocked_by : TransformLookupError or None
+        The error with which it was parked; None if the kernel has parked it, because newer samples are all it lacks.
+    limits : list of (str, Place)
+        Its places under the edges that have a limit for it, once its first limit is passed.
+    indexed : bool
+        Whether the index has noted the names of its questions.
     """
 
-    __slots__ = (
-        "blocked_by",
-        "indexed",
-        "limit",
-        "limits",
-        "names",
-        "others",
-        "question",
-        "share",
-        "since",
-    )
+    others: tuple[Question, ...] = ()
+    share: "Share | None" = None
+    patience = math.inf
+    blocked_by: TransformLookupError | None = None
+    limits: list[tuple[str, Place]] | None = None
+    indexed = False
 
-    def __init__(
-        self, question: Question, since: int, wake: Callable[[], object], others: tuple[Question, ...] = ()
-    ) -> None:
-        self.question = question
-        self.since = since
-        self.wake = wake
-        self.others = others
-        self.plain = (question.target, question.source, question.at) if question.is_plain else None
-        self.answer = None
-        self.version = 0
-        self.place = None
-        self.elsewhere = False
-        self.blocked_by: TransformLookupError | None = None
-        self.share: Share | None = None
-        self.names: tuple[str, ...] = ()
-        self.limit: Place | None = None
-        self.limits: list[tuple[str, Place]] = []
-        self.indexed = False
+    @property
+    def question(self) -> Question:
+        """The question that it asks."""
+        return Question(*self.asked)
 
-    def asked(self) -> set[str]:
+    @property
+    def cause(self) -> Hashable:
+        """Equal for waiters that wait for the same."""
+        return FutureExtrapolationError if self.blocked_by is None else type(self.blocked_by), self.names
+
+    def frames(self) -> set[str]:
         """The frames that the questions name."""
         names = {self.question.target, self.question.source}
         if self.question.fixed is not None:
@@ -261,6 +244,10 @@ class WaitingIndex:
         All waiters in the order in which they came.
     limits : list of (-stamp, -order, Waiter)
         The first limit of each waiter that has one, if no frame has passed it, sorted.
+    passed : int
+        The newest stamp that has passed a limit, in ns.
+    orders : iterator of int
+        Numbers the places.
     """
 
     def __init__(self) -> None:
@@ -270,8 +257,8 @@ class WaitingIndex:
         # waiter that is in it.
         self._by_name: dict[str, dict[Waiter, None]] = {}
         self.limits: list[Place] = []
-        self._passed = STAMP_MIN
-        self._order = count()
+        self.passed = STAMP_MIN
+        self.orders = count()
 
     def __len__(self) -> int:
         return len(self.parked)
@@ -301,22 +288,23 @@ class WaitingIndex:
         TypeError
             If `error` is of a kind that waiting cannot help.
         """
-        waiter.names = blocking_frames(error)
+        names = blocking_frames(error)
         cause = error.__cause__
         if isinstance(cause, (*MAY_COME, GapError)):
             # At the newest common stamp another sample is missing as well; late data may bring it.
             also = (cause.child,) if isinstance(cause, GapError) else blocking_frames(cause)
-            waiter.names = tuple(dict.fromkeys((*waiter.names, *also)))
+            names = tuple(dict.fromkeys((*names, *also)))
+        waiter.names = names
         waiter.blocked_by = error
         self.parked[waiter] = None
         try:
-            if isinstance(error, FutureExtrapolationError) and len(waiter.names) == 1:
+            if isinstance(error, FutureExtrapolationError) and len(names) == 1:
                 needed = STAMP_MIN if isinstance(error.stamp, Latest) else error.stamp - error.slack
-                waiter.place = (-needed, -next(self._order), waiter)
+                waiter.place = (-needed, -next(self.orders), waiter)
                 insort(self._under(error.child).places, waiter.place)
             else:
                 waiter.place = None
-                for name in waiter.names:
+                for name in names:
                     self._under(name).for_any[waiter] = None
             self.set_limits(waiter, limits)
         except BaseException:
@@ -328,16 +316,15 @@ class WaitingIndex:
         """Note the limits of a parked waiter that has none."""
         first = _NEVER
         for frame, limit in limits:
-            if limit < self._passed:
-                place = (-limit, -next(self._order), waiter)
+            if limit < self.passed:
+                place = (-limit, -next(self.orders), waiter)
                 waiter.elsewhere = True
-                waiter.limits.append((frame, place))
+                waiter.limits = [*(waiter.limits or ()), (frame, place)]
                 insort(self._under(frame).limits, place)
             elif limit < first:
                 first = limit
         if first < _NEVER:
-            waiter.limit = (-first, -next(self._order), waiter)
-            waiter.elsewhere = True
+            waiter.limit = (-first, -next(self.orders), waiter)
             insort(self.limits, waiter.limit)
 
     def remove(self, waiter: Waiter) -> None:
@@ -345,7 +332,7 @@ class WaitingIndex:
         if waiter not in self.parked:
             return
         self.forget(waiter)
-        for name in waiter.names:
+        for name in waiter.names or ():
             blocked = self.by_frame.get(name)
             if blocked is not None:
                 if waiter.place is not None:
@@ -383,7 +370,7 @@ class WaitingIndex:
 
     def pop_limited(self, stamp: int) -> list[Waiter]:
         """Take the first limit from each waiter whose limit is older than `stamp`; return these, which stay parked."""
-        self._passed = max(self._passed, stamp)
+        self.passed = max(self.passed, stamp)
         limits = self.limits
         found = []
         while limits and -limits[-1][0] < stamp:
@@ -406,14 +393,13 @@ class WaitingIndex:
         """Remove and return all waiters."""
         ready = list(self.parked)
         for waiter in ready:
-            waiter.place = waiter.limit = None
-            waiter.limits.clear()
+            waiter.place = waiter.limit = waiter.limits = None
             waiter.indexed = False
         self.parked.clear()
         self._by_name.clear()
         self.by_frame.clear()
         self.limits.clear()
-        self._passed = STAMP_MIN
+        self.passed = STAMP_MIN
         return ready
 
     def forget(self, waiter: Waiter) -> None:
@@ -425,7 +411,7 @@ class WaitingIndex:
             if waiter.limits:
                 self._forget_limits(waiter)
             if waiter.indexed:
-                for name in waiter.asked():
+                for name in waiter.frames():
                     waiters = self._by_name.get(name)
                     if waiters is not None:
                         waiters.pop(waiter, None)
@@ -441,18 +427,18 @@ class WaitingIndex:
         fresh = list(takewhile(lambda waiter: not waiter.indexed, reversed(self.parked)))
         for waiter in reversed(fresh):
             waiter.indexed = waiter.elsewhere = True
-            for name in waiter.asked():
+            for name in waiter.frames():
                 self._by_name.setdefault(name, {})[waiter] = None
         return self._by_name
 
     def _forget_limits(self, waiter: Waiter) -> None:
         """Remove a waiter from under each edge that has a limit for it."""
-        for frame, place in waiter.limits:
+        for frame, place in waiter.limits or ():
             blocked = self.by_frame.get(frame)
             if blocked is not None:
                 _discard(blocked.limits, place)
                 self._drop_if_empty(frame, blocked)
-        waiter.limits.clear()
+        waiter.limits = None
 
     def _under(self, frame: str) -> Line:
         blocked = self.by_frame.get(frame)
@@ -468,14 +454,6 @@ class WaitingIndex:
         """The waiters of one buffer; for any thread."""
         # Copied first, because another thread may call this while the loop parks and wakes.
         return [waiter for waiter in list(self.parked) if waiter.share is share]
-
-    def pending(self, share: "Share | None" = None) -> tuple[PendingLookup, ...]:
-        """The waiting lookups of one buffer, or of all, with the errors that block them; for any thread."""
-        return tuple(
-            PendingLookup(waiter.question, waiter.since, waiter.blocked_by)
-            for waiter in (list(self.parked) if share is None else self.of(share))
-            if waiter.blocked_by is not None
-        )
 
 
 def _discard(places: list[Place], place: Place) -> None:
@@ -536,19 +514,23 @@ class LiveTree:
         self._watches = self.watching.by_frame
         # What still reads the forest for a buffer that was closed since the last change.
         self._closed: list[ref[ReadsForest]] = []
-        waiting = self.waiting
-        self.feed: Any = None
-        if Feed is not None:
-            self.feed = Feed(
-                forest.paths,
-                forest.frames,
-                forest.readers,
-                waiting.by_frame,
-                waiting.parked,
-                waiting.limits,
-                self.watching.by_frame,
-                waiting.forget,
-            )
+        self.feed = self.make_feed()
+
+    def make_feed(self) -> Any:
+        """A `Feed` of this tree; None without the compiled kernel."""
+        if Feed is None:
+            return None
+        forest, waiting = self.forest, self.waiting
+        return Feed(
+            forest.paths,
+            forest.frames,
+            forest.readers,
+            waiting.by_frame,
+            waiting.parked,
+            waiting.limits,
+            self.watching.by_frame,
+            waiting,
+        )
 
     def insert(self, batch: Batch) -> None:
         """Insert a batch that the bus has judged, and wake the lookups and watches that it concerns."""
@@ -588,7 +570,8 @@ class LiveTree:
         TypeError
             If `error` is of a kind that waiting cannot help.
         """
-        self.waiting.park(waiter, error, self._limits(waiter, error))
+        blocking = (error.child,) if isinstance(error, FutureExtrapolationError) else ()
+        self.waiting.park(waiter, error, self._limits(waiter, blocking))
 
     def remove_frame(self, frame: str) -> None:
         """Forget a frame, if it is known, and wake the lookups and watches that it concerns."""
@@ -644,23 +627,22 @@ class LiveTree:
         """Wake waiters, each with its answer if the kernel has one; it counts as long as the forest stays as it is."""
         paths = self.forest.paths
         for waiter in waiters:
-            if waiter.plain is not None:
-                waiter.answer = paths.answer(*waiter.plain)
+            if waiter.question.is_plain:
+                waiter.answer = paths.answer(*waiter.question[:3])
                 waiter.version = paths.version
         _wake(waiters)
 
-    def _limits(self, waiter: Waiter, error: TransformLookupError | None) -> list[tuple[str, int]]:
-        """The limits of all edges except the blocking one, whose next sample wakes the waiter in any case."""
-        blocking = error.child if isinstance(error, FutureExtrapolationError) else None
+    def _limits(self, waiter: Waiter, blocking: Container[str]) -> list[tuple[str, int]]:
+        """The limits of all edges except the blocking ones, whose next sample wakes the waiter in any case."""
         limits = limits_of(self.forest, waiter.question, blocking)
         for other in waiter.others:
-            limits += limits_of(self.forest, other, None)
+            limits += limits_of(self.forest, other, ())
         return limits
 
     def _wake_hopeless(self, stamp: int) -> None:
         """Wake the waiters that samples up to a stamp (ns) have made hopeless."""
         for waiter in self.waiting.pop_limited(stamp):
-            limits = self._limits(waiter, waiter.blocked_by)
+            limits = self._limits(waiter, waiter.names or ())
             if any(
                 (newest := self.forest.frames[frame].newest) is not None and newest > limit for frame, limit in limits
             ):
@@ -725,15 +707,16 @@ class Share:
         state.share = self
         self.live.watching.add(state)
 
-    def pending(self) -> tuple[PendingLookup, ...]:
-        """The waiting lookups with the errors that block them; for any thread."""
-        return self.live.waiting.pending(self)
+    @property
+    def waiters(self) -> list[Waiter]:
+        """The waiting lookups; for any thread."""
+        return self.live.waiting.of(self)
 
     def end(self, reason: str) -> None:
         """Wake the waiting lookups and watches for the last time; only the first reason counts."""
         if self.end_reason is None:
             self.end_reason = reason
-        waiters = self.live.waiting.of(self)
+        waiters = self.waiters
         for waiter in waiters:
             self.live.waiting.remove(waiter)
         _wake(waiters)
@@ -761,12 +744,12 @@ class Share:
     @property
     def has_waiters(self) -> bool:
         """Whether a task or a callback has to be told of the end, which only the thread of the event loop may do."""
-        return bool(self._end_callbacks) or bool(self.live.waiting.of(self)) or self.live.watching.has_waiters(self)
+        return bool(self._end_callbacks) or bool(self.waiters) or self.live.watching.has_waiters(self)
 
     def statistics(self, samples: int) -> BufferStatistics:
         """The counters since the buffer joined, given the number of samples that its bus has published by now."""
         offered, inserted, replaced, expired, *others = map(sub, self.live.counters(samples), self._before)
-        waiting = len(self.live.waiting.of(self))
+        waiting = len(self.waiters)
         return BufferStatistics(offered, inserted, replaced, expired, waiting, *others)
 
 

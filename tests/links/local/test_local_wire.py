@@ -16,7 +16,7 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from random import Random
-from time import monotonic
+from time import thread_time
 
 import anyio
 import anyio.lowlevel
@@ -270,8 +270,8 @@ async def test_a_link_that_floods_leaves_other_tasks_their_turns(directory: str)
     def receive(_: str, item: object) -> None:
         nonlocal most, since_turn, total
         if isinstance(item, bytes):
-            until = monotonic() + 0.0002
-            while monotonic() < until:
+            until = thread_time() + 0.0002
+            while thread_time() < until:
                 pass
             since_turn, total = since_turn + 1, total + 1
             most = max(most, since_turn)
@@ -290,7 +290,7 @@ async def test_a_link_that_floods_leaves_other_tasks_their_turns(directory: str)
             tasks.cancel_scope.cancel()
     finally:
         await wire.close()
-    # A turn has 1 ms.
+    # A turn has 1 ms, and trio may let a task be the last of one round and the first of the next.
     assert most <= 12
 
 

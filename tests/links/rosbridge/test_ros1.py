@@ -230,8 +230,8 @@ async def test_the_frames_of_a_robot_are_those_of_the_real_robot_state_publisher
 
 @pytest.mark.parametrize("link_first", [True, False])
 async def test_roslib_and_a_link_hear_the_same_topics_of_one_server(tmp_path: Path, link_first: bool) -> None:
-    install_roslib(tmp_path)
     async with ros1(tmp_path) as ros, AsyncExitStack() as stack:
+        install_roslib(tmp_path)
         bus = stack.enter_context(Bus())
         buffer = stack.enter_context(Buffer(bus))
         bus.publish(static("base", "lidar", 2.0))

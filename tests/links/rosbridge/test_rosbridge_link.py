@@ -133,7 +133,7 @@ PIECES = [b"\xff", b"\x9b", b"\xbb", b"\xdb", b"\xc2", b"\x5f", b"\xfb\x7f\xf0"]
 PIECES += [b"[", b"{", b'"', b"1" * 5_000, b"NaN", b"1e999"]
 
 
-@pytest.mark.parametrize("cases", [150, pytest.param(5_000, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("cases", [150, pytest.param(1_000, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("size", [1, 100])
 async def test_no_damaged_message_ends_a_link_and_each_is_counted_or_heard(cases: int, size: int) -> None:
     random = Random(cases)
@@ -296,6 +296,7 @@ def test_arguments_that_are_not_valid_are_refused(url: Any, options: Any, said: 
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
 async def test_roslib_hears_what_a_link_publishes(tmp_path: Path) -> None:
     install_roslib(tmp_path)
     samples = {"/tf": moving("map", "base", 1_000_000_005, 1.5), "/tf_static": static("base", "lidar", 2.0)}

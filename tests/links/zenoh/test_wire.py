@@ -4,13 +4,14 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import AsyncExitStack, contextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from itertools import product
 from typing import Any
 
 import anyio
 import anyio.lowlevel
+import anyio.to_thread
 import pytest
 import zenoh
 from hypothesis import given
@@ -446,10 +447,14 @@ async def test_a_link_closes_while_its_router_is_stopped(address: str, domain: s
 # Strangers
 
 
-@contextmanager
-def stranger(address: str) -> Iterator[zenoh.Session]:
-    """A session of zenoh that says what it likes."""
+@asynccontextmanager
+async def stranger(address: str, ear: Ear) -> AsyncIterator[zenoh.Session]:
+    """A session of zenoh that says what it likes, once the router knows what a link hears."""
     with open_client(client_config(address, None, None), address) as session:
+        # The token is the last thing that the link declares.
+        token = session.liveliness().declare_subscriber(f"tfbus/**/@alive/{ear.id}/*", history=True)
+        await anyio.to_thread.run_sync(token.recv)
+        token.undeclare()
         yield session
 
 
@@ -482,7 +487,7 @@ ID, OTHER = "0123456789abcdef" * 2, "fedcba9876543210" * 2
 )
 async def test_a_token_that_no_link_would_make_is_ignored(token: str, address: str, domain: str) -> None:
     async with ZenohRouter(address), listening(domain, connect=address) as one:
-        with stranger(address) as session:
+        async with stranger(address, one) as session:
             bad = session.liveliness().declare_token(f"tfbus/{domain}/{token}")
             good = session.liveliness().declare_token(f"tfbus/{domain}/~/@alive/{OTHER}/1")
             await until(lambda: OTHER in one.present)
@@ -493,24 +498,23 @@ async def test_a_token_that_no_link_would_make_is_ignored(token: str, address: s
 
 
 async def test_a_newer_session_of_a_link_counts_and_an_older_one_no_more(address: str, domain: str) -> None:
-    async with ZenohRouter(address), listening(domain, connect=address) as one:
-        with stranger(address) as session:
-            liveliness = session.liveliness()
-            key = f"tfbus/{domain}/r/@alive/{ID}"
-            second = liveliness.declare_token(f"{key}/2")
-            first = liveliness.declare_token(f"{key}/1")
-            third = liveliness.declare_token(f"{key}/3")
-            second.undeclare()
-            first.undeclare()
-            await heard_again(one, session, domain, ID)
-            assert one.items == [(ID, Joined("r")), (ID, Left()), (ID, Joined("r")), (ID, b"end")]
-            third.undeclare()
-            await until(lambda: not one.present)
+    async with ZenohRouter(address), listening(domain, connect=address) as one, stranger(address, one) as session:
+        liveliness = session.liveliness()
+        key = f"tfbus/{domain}/r/@alive/{ID}"
+        second = liveliness.declare_token(f"{key}/2")
+        first = liveliness.declare_token(f"{key}/1")
+        third = liveliness.declare_token(f"{key}/3")
+        second.undeclare()
+        first.undeclare()
+        await heard_again(one, session, domain, ID)
+        assert one.items == [(ID, Joined("r")), (ID, Left()), (ID, Joined("r")), (ID, b"end")]
+        third.undeclare()
+        await until(lambda: not one.present)
 
 
 async def test_what_is_published_by_no_link_that_is_present_is_ignored(address: str, domain: str) -> None:
     async with ZenohRouter(address), listening(domain, connect=address) as one:
-        with stranger(address) as session:
+        async with stranger(address, one) as session:
             for end in (ID, "x", one.id, ID.upper(), "é" * 100):
                 put(session, f"tfbus/{domain}/~/{LIVE}/{end}", b"garbage")
             await heard_again(one, session, domain, ID)
@@ -522,7 +526,7 @@ async def test_a_message_for_one_link_without_a_sender_is_ignored(
     attachment: bytes | None, address: str, domain: str
 ) -> None:
     async with ZenohRouter(address), listening(domain, connect=address) as one:
-        with stranger(address) as session:
+        async with stranger(address, one) as session:
             put(session, f"tfbus/{domain}/@to/{one.id}", b"garbage", attachment)
             await heard_again(one, session, domain, ID)
         assert one.items == [(ID, b"end")]
@@ -531,15 +535,14 @@ async def test_a_message_for_one_link_without_a_sender_is_ignored(
 async def test_a_message_that_is_too_large_is_refused_and_one_that_is_far_too_large_not_even_assembled(
     address: str, domain: str
 ) -> None:
-    async with ZenohRouter(address), listening(domain, connect=address) as one:
-        with stranger(address) as session:
-            key = f"tfbus/{domain}/@to/{one.id}"
-            for size in (MAX_MESSAGE, MAX_MESSAGE + 1, MAX_MESSAGE + 2**18, 5 * MAX_MESSAGE):
-                put(session, key, bytes(size), bytes.fromhex(ID))
-            await heard_again(one, session, domain, ID)
-            kinds = [len(item) if isinstance(item, bytes) else type(item) for _, item in one.items]
-            assert kinds == [MAX_MESSAGE, MalformedMessageError, 3]
-            assert "oversized" in str(one.items[1][1])
+    async with ZenohRouter(address), listening(domain, connect=address) as one, stranger(address, one) as session:
+        key = f"tfbus/{domain}/@to/{one.id}"
+        for size in (MAX_MESSAGE, MAX_MESSAGE + 1, MAX_MESSAGE + 2**18, 5 * MAX_MESSAGE):
+            put(session, key, bytes(size), bytes.fromhex(ID))
+        await heard_again(one, session, domain, ID)
+        kinds = [len(item) if isinstance(item, bytes) else type(item) for _, item in one.items]
+        assert kinds == [MAX_MESSAGE, MalformedMessageError, 3]
+        assert "oversized" in str(one.items[1][1])
 
 
 @given(st.text("ab*", min_size=1, max_size=8), st.text("ab", max_size=8))

@@ -1,11 +1,16 @@
+from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest
+import zenoh
 from support.processes import free_address, until
 from support.zenoh_wires import LIVE, Ear, Way, listening, met, start_router, talk, way_to
 
 from tfbus.links.seams import Joined, Left
+from tfbus.links.zenoh import zenoh_router
+from tfbus.links.zenoh.neighbours import Neighbours
 from tfbus.links.zenoh.sessions import router_config
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
 
@@ -49,6 +54,26 @@ async def test_links_that_listen_and_connect_to_each_other_hear_each_other_after
         await hear_each_other_after_each_break(one, two, way, back)
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_routers_in_a_ring_tell_each_other_all_after_breaks_that_follow_fast(domain: str) -> None:
+    addresses = [free_address() for _ in range(3)]
+    async with AsyncExitStack() as stack:
+        ways = [await stack.enter_async_context(way_to(address)) for address in addresses]
+        for address, way in zip(addresses, ways[1:] + ways[:1], strict=True):
+            stack.enter_context(start_router(address, way.address))
+        ears = [await stack.enter_async_context(listening(domain, connect=address)) for address in addresses]
+        for breaks in range(1, 4):
+            await met(*ears)
+            await talk(*ears)
+            for _ in range(breaks):
+                await until(lambda: all(way.open for way in ways))
+                for way in ways:
+                    await way.cut()
+        await met(*ears)
+        await talk(*ears)
+
+
 async def hear_each_other_after_each_break(one: Ear, two: Ear, way: Way, back: Way) -> None:
     for _ in range(3):
         await met(one, two)
@@ -85,6 +110,41 @@ async def test_an_address_in_use_is_an_os_error_and_a_router_is_entered_once(add
             await router.__aenter__()
     async with ZenohRouter(address):
         pass
+
+
+@pytest.mark.parametrize("breaks", ["at first", "later"])
+async def test_a_router_whose_session_breaks_at_once_says_so_at_first_and_later_has_another_one(
+    breaks: str, address: str, domain: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds: list[Any] = [Broken] if breaks == "at first" else [Silent, Broken]
+    monkeypatch.setattr(zenoh_router, "Neighbours", lambda session: (kinds.pop(0) if kinds else Neighbours)(session))
+    if breaks == "at first":
+        with pytest.raises(OSError, match="the session of a router broke at once: closed"):
+            async with ZenohRouter(address):
+                raise AssertionError("it has opened")
+    async with (
+        ZenohRouter(address),
+        listening(domain, connect=address) as one,
+        listening(domain, connect=address) as two,
+    ):
+        await until(lambda: not kinds)
+        await met(one, two)
+        await talk(one, two)
+
+
+class Broken(Neighbours):
+    """A session that has broken before anything is declared."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        super().__init__(session)
+        raise zenoh.ZError("closed")
+
+
+class Silent(Neighbours):
+    """A router that is told nothing from the beginning."""
+
+    def are_silent(self, now: float) -> bool:  # noqa: ARG002 - at any time
+        return True
 
 
 RULES = """{

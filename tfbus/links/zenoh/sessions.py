@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from time import monotonic
 from typing import Any, Final, Protocol
 
 import zenoh
@@ -282,6 +283,12 @@ class Keeper:
         """Wait for the next change, for so long at most; for the thread."""
         self.changed.wait(seconds)
         self.changed.clear()
+
+    def rest(self, seconds: float) -> None:
+        """Wait for so long, whatever changes, unless the thread is to end; for the thread."""
+        end = monotonic() + seconds
+        while not self.stopped and (left := end - monotonic()) > 0:
+            self.wait(left)
 
     def stop(self) -> None:
         """Have the thread end; from any thread."""

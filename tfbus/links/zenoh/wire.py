@@ -47,7 +47,7 @@ import zenoh
 
 from tfbus._aio.loops import LoopWaker
 from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
-from tfbus.links.zenoh.neighbours import PAUSE_TO_LISTEN, PERIOD, Neighbours, open_router
+from tfbus.links.zenoh.neighbours import PAUSE_TO_BEGIN, PAUSE_TO_LISTEN, PERIOD, Neighbours, open_router
 from tfbus.links.zenoh.sessions import (
     LONGEST_NAME,
     Addresses,
@@ -213,6 +213,8 @@ class ZenohWire(Wire):
                 return
             session.hearer.end()
             begin_to_close(session)
+            if self._is_router:
+                self._keeper.rest(PAUSE_TO_BEGIN)
             self._addresses.rotate(-1)
 
     def _connect(self, channels: Iterable[str]) -> "_Session | None":

@@ -7,14 +7,16 @@ from typing import Final, Self
 
 import anyio
 import anyio.to_thread
+import zenoh
 
-from tfbus.links.zenoh.neighbours import PAUSE_TO_LISTEN, PERIOD, Neighbours, open_router
+from tfbus.links.zenoh.neighbours import PAUSE_TO_BEGIN, PAUSE_TO_LISTEN, PERIOD, Neighbours, open_router
 from tfbus.links.zenoh.sessions import (
     Addresses,
     Keeper,
     Settings,
     begin_to_close,
     close_session,
+    os_error,
     router_config,
 )
 from tfbus.registration import warn_unless_entered
@@ -89,12 +91,20 @@ class ZenohRouter:
     ) -> None:
         await self._keeper.end()
 
+    def _open(self) -> Neighbours:
+        session = open_router(self._config)
+        try:
+            return Neighbours(session)
+        except zenoh.ZError as error:
+            close_session(session)
+            raise os_error(error, "the session of a router broke at once") from error
+
     def _keep(self) -> None:
         """Have one session after another, until the router is closed; the first one has to open."""
         keeper = self._keeper
         while not (self._opened.is_set() and keeper.stopped):
             try:
-                router = Neighbours(open_router(self._config))
+                router = self._open()
             except OSError as error:
                 if not self._opened.is_set():
                     self._failure = error
@@ -110,3 +120,4 @@ class ZenohRouter:
                 close_session(router)
             else:
                 begin_to_close(router)
+                keeper.rest(PAUSE_TO_BEGIN)
