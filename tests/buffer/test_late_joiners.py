@@ -151,7 +151,7 @@ class Alone:
 
     def __init__(self, before: list[Happening], keep: int) -> None:
         self.keep = keep
-        # What had happened when a buffer of the same history joined first.
+        # All that had happened when the first buffer of the same history joined.
         self.before = before
         self.clock = SimulatedClock(1_000)
         self.bus = Bus(self.clock)

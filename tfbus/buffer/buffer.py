@@ -106,7 +106,7 @@ class Buffer:
         self._stand_on(self._share.live.forest)
 
     def _prefilled(self, prefill: "Buffer | TransformTree | None", window: int | None) -> Forest | LiveTree | None:
-        """What the buffer begins with: nothing, the live tree of a buffer that has all it would have, or a copy."""
+        """Nothing to begin with, or the live tree of a buffer that has all it would have, or a copy of a buffer."""
         if prefill is None:
             return None
         tree = prefill

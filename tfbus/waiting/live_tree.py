@@ -512,7 +512,7 @@ class LiveTree:
         self.superseded = 0
         self._waiters = self.waiting.by_frame
         self._watches = self.watching.by_frame
-        # What still reads the forest for a buffer that was closed since the last change.
+        # The readers of the forest for buffers that were closed since the last change.
         self._closed: list[ref[ReadsForest]] = []
         self.feed = self.make_feed()
 
