@@ -50,7 +50,7 @@ LIMIT, THOROUGH_LIMIT = 60.0, float(os.environ.get("THOROUGH_LIMIT", "280"))
 """The longest that a test of each suite may take, in s; benchmarks have the time of thorough tests."""
 
 MORE_EXAMPLES = int(os.environ.get("EXAMPLES", "50"))
-"""How many the thorough suite takes in each test of hypothesis."""
+"""The number of examples that the thorough suite takes in each test of hypothesis."""
 
 EXAMPLES = settings(deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("default", EXAMPLES, max_examples=10, derandomize=True)
