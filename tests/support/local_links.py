@@ -1,11 +1,10 @@
-"""Links of one machine: wires of this process, and a peer of the tests that speaks their protocol itself."""
+"""The files of the links of one machine, and a peer of the tests that speaks their protocol itself."""
 
 import hmac
 import secrets
 import socket
 import struct
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager, suppress
+from contextlib import suppress
 from hashlib import blake2b
 from pathlib import Path
 from typing import Self
@@ -13,75 +12,7 @@ from typing import Self
 import anyio
 import anyio.abc
 
-from tfbus.links.local.local_wire import LocalWire
-from tfbus.links.seams import Hearing, Joined, Left, WireItem
-from tfbus.tf_message import MalformedMessageError
-
-ALL = (Hearing("*", "all"),)
 PATIENCE = 20.0
-
-
-class Ear:
-    """Keeps all items of one wire."""
-
-    def __init__(self) -> None:
-        self.items: list[tuple[str, WireItem]] = []
-        self.warnings: list[Exception] = []
-        self._changed = anyio.Event()
-
-    def receive(self, link: str, item: WireItem) -> None:
-        self.items.append((link, item))
-        self._changed.set()
-
-    def warn(self, error: Exception) -> None:
-        self.warnings.append(error)
-        self._changed.set()
-
-    async def until(self, holds: Callable[[], bool]) -> None:
-        """Wait until something holds, which is looked at when something has come."""
-        with anyio.fail_after(PATIENCE):
-            while not holds():
-                self._changed = anyio.Event()
-                await self._changed.wait()
-
-    async def joined(self, link: str) -> None:
-        await self.until(lambda: link in self.present())
-
-    async def left(self, link: str) -> None:
-        await self.until(lambda: (link, Left()) in self.items and link not in self.present())
-
-    def present(self) -> dict[str, str]:
-        """The robots of the links that have joined and not left."""
-        here: dict[str, str] = {}
-        for link, item in self.items:
-            if isinstance(item, Joined):
-                assert link not in here
-                here[link] = item.robot
-            elif isinstance(item, Left):
-                del here[link]
-        return here
-
-    def messages(self, link: str) -> list[bytes]:
-        return [item for sender, item in self.items if sender == link and isinstance(item, bytes)]
-
-    def refused(self, link: str) -> list[str]:
-        return [
-            item.reason for sender, item in self.items if sender == link and isinstance(item, MalformedMessageError)
-        ]
-
-
-@asynccontextmanager
-async def running(wire: LocalWire, hears: Sequence[Hearing] = ALL) -> AsyncIterator[Ear]:
-    """Use a wire as a link does."""
-    ear = Ear()
-    try:
-        await wire.open(hears, ear.receive, ear.warn)
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(wire.run)
-            yield ear
-            tasks.cancel_scope.cancel()
-    finally:
-        await wire.close()
 
 
 def files_in(directory: str) -> list[Path]:

@@ -8,68 +8,19 @@ from typing import Any
 import anyio
 from anyio.abc import SocketStream
 from support.processes import Program, free_address, until
+from support.wires import HEARS_ALL, LIVE, Ear, running
 
-from tfbus.links.seams import Hearing, Joined, Left, WireItem
+from tfbus.links.seams import Hearing
 from tfbus.links.zenoh.wire import ZenohWire
-
-LIVE = "live"
-HEARS_ALL = (Hearing("*", LIVE),)
-
-
-class Ear:
-    """A wire with everything that has come by it."""
-
-    def __init__(self, wire: ZenohWire) -> None:
-        self.wire = wire
-        self.id = wire.id
-        self.items: list[tuple[str, WireItem]] = []
-        self.warnings: list[Exception] = []
-
-    @property
-    def present(self) -> dict[str, str]:
-        """The robot of each link that is there."""
-        found: dict[str, str] = {}
-        for link, item in list(self.items):
-            if isinstance(item, Joined):
-                assert link not in found, "it has not left"
-                found[link] = item.robot
-            elif isinstance(item, Left):
-                del found[link]
-        return found
-
-    @property
-    def messages(self) -> list[tuple[str, bytes]]:
-        return [(link, item) for link, item in list(self.items) if isinstance(item, bytes)]
-
-    def of(self, other: "Ear") -> list[WireItem]:
-        """All items of another one."""
-        return [item for link, item in list(self.items) if link == other.id]
-
-    def receive(self, link: str, item: WireItem) -> None:
-        self.items.append((link, item))
 
 
 @asynccontextmanager
 async def listening(
     domain: str, robot: str = "", *, hears: Sequence[Hearing] = HEARS_ALL, **options: Any
 ) -> AsyncIterator[Ear]:
-    """A wire that is open, and closed at the end."""
-    ear = Ear(wire := ZenohWire(domain, robot, **options))
-    try:
-        await wire.open(hears, ear.receive, ear.warnings.append)
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(wire.run)
-            yield ear
-            tasks.cancel_scope.cancel()
-    finally:
-        await wire.close()
-
-
-async def met(*ears: Ear) -> None:
-    """Wait until all of them are present to each other."""
-    for ear in ears:
-        others = {other.id for other in ears} - {ear.id}
-        await until(lambda ear=ear, others=others: others <= set(ear.present))  # type: ignore[misc]
+    """A wire over zenoh that is open, and closed at the end."""
+    async with running(ZenohWire(domain, robot, **options), hears) as ear:
+        yield ear
 
 
 async def talk(*ears: Ear) -> None:

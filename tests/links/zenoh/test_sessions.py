@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 import zenoh
 from support.processes import free_address, until
-from support.zenoh_wires import LIVE, listening, met, talk
+from support.wires import LIVE, met
+from support.zenoh_wires import listening, talk
 
 from tfbus.links.seams import MAX_MESSAGE, Joined
 from tfbus.links.zenoh.sessions import (

@@ -1,12 +1,9 @@
 import gc
-import os
-import re
 import signal
 import sys
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
-from itertools import product
 from typing import Any
 
 import anyio
@@ -14,10 +11,9 @@ import anyio.lowlevel
 import anyio.to_thread
 import pytest
 import zenoh
-from hypothesis import given
-from hypothesis import strategies as st
 from support.processes import OPEN_FILES, Program, free_address, until
-from support.zenoh_wires import LIVE, Ear, listening, met, start_router, talk
+from support.wires import LIVE, Ear, met
+from support.zenoh_wires import listening, start_router, talk
 
 from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left
 from tfbus.links.zenoh.sessions import client_config, open_client
@@ -29,88 +25,6 @@ pytestmark = pytest.mark.anyio
 
 
 # Messages between links
-
-
-@pytest.mark.every_loop
-async def test_links_meet_and_what_one_publishes_comes_to_all_others(address: str, domain: str) -> None:
-    async with (
-        ZenohRouter(address),
-        listening(domain, "r1", connect=address) as one,
-        listening(domain, "r2", connect=address) as two,
-        listening(domain, connect=address) as three,
-    ):
-        await met(one, two, three)
-        assert three.present == {one.id: "r1", two.id: "r2"}
-        assert one.present == {two.id: "r2", three.id: ""}
-        assert one.wire.is_heard(LIVE)
-        one.wire.publish(LIVE, b"of one")
-        await until(lambda: bool(two.messages and three.messages))
-        assert three.wire.is_heard(LIVE)
-        three.wire.publish(LIVE, b"of three")
-        await until(lambda: len(two.messages) == 2 and bool(one.messages))
-    assert one.messages == [(three.id, b"of three")]
-    assert two.messages == [(one.id, b"of one"), (three.id, b"of three")]
-    assert three.messages == [(one.id, b"of one")]
-
-
-async def test_links_of_other_domains_are_not_there(address: str, domain: str) -> None:
-    async with (
-        ZenohRouter(address),
-        listening(domain, connect=address) as one,
-        listening(f"{domain}/more", connect=address) as more,
-        listening("another", connect=address) as another,
-        listening(domain, connect=address) as two,
-    ):
-        await met(one, two)
-        for ear in (one, more, another):
-            ear.wire.publish(LIVE, ear.id.encode())
-        one.wire.send(two.id, b"end")
-        await until(lambda: (one.id, b"end") in two.messages)
-        assert set(two.present) == {one.id}
-    assert two.messages == [(one.id, one.id.encode()), (one.id, b"end")]
-    assert more.items == another.items == []
-
-
-async def test_the_first_hearing_that_matches_a_robot_says_which_channel_is_heard(address: str, domain: str) -> None:
-    hears = (Hearing("r1", "live"), Hearing("r*", "slow"), Hearing("", "live"))
-    async with (
-        ZenohRouter(address),
-        listening(domain, "r1", connect=address, hears=()) as one,
-        listening(domain, "r22", connect=address, hears=()) as two,
-        listening(domain, connect=address, hears=()) as nameless,
-        listening(domain, "arm", connect=address, hears=()) as arm,
-        listening(domain, "hearer", connect=address, hears=hears) as hearer,
-    ):
-        await until(lambda: len(hearer.present) == 3)
-        senders = (one, two, nameless, arm)
-        for ear, channel in product(senders, ("live", "slow")):
-            ear.wire.publish(channel, channel.encode())
-        for ear in senders:
-            ear.wire.send(hearer.id, b"end")
-        await until(lambda: sum(message == b"end" for _, message in hearer.messages) == 4)
-        assert hearer.of(one) == [Joined("r1"), b"live", b"end"]
-        assert hearer.of(two) == [Joined("r22"), b"slow", b"end"]
-        assert hearer.of(nameless) == [Joined(""), b"live", b"end"]
-        assert hearer.of(arm) == [b"end"], "it is not announced"
-        assert [ear.items for ear in senders] == [[]] * 4, "they hear nobody"
-
-
-async def test_a_message_for_one_link_comes_to_no_other_and_also_to_one_that_does_not_hear_the_sender(
-    address: str, domain: str
-) -> None:
-    async with (
-        ZenohRouter(address),
-        listening(domain, "r1", connect=address) as one,
-        listening(domain, "r2", connect=address, hears=[Hearing("r3", LIVE)]) as deaf,
-        listening(domain, connect=address) as other,
-    ):
-        await until(lambda: set(one.present) == {deaf.id, other.id})
-        assert one.wire.send(deaf.id, b"question")
-        await until(lambda: deaf.messages == [(one.id, b"question")])
-        assert deaf.wire.send(one.id, b"answer")
-        await until(lambda: one.messages == [(deaf.id, b"answer")])
-        assert deaf.present == {}
-    assert other.messages == []
 
 
 async def test_messages_of_both_kinds_come_in_the_order_in_which_they_went(address: str, domain: str) -> None:
@@ -130,28 +44,6 @@ async def test_messages_of_both_kinds_come_in_the_order_in_which_they_went(addre
                 # A network without room may drop published messages.
                 await until(lambda: len(two.messages) == number + 1)  # noqa: B023
     assert [message for _, message in two.messages] == sent
-
-
-async def test_large_messages_arrive_whole(address: str, domain: str) -> None:
-    async with (
-        ZenohRouter(address),
-        listening(domain, connect=address) as one,
-        listening(domain, connect=address) as two,
-    ):
-        await met(one, two)
-        message = os.urandom(2**16) * (MAX_MESSAGE // 2**16)
-        one.wire.publish(LIVE, message)
-        await until(lambda: two.messages == [(one.id, message)])
-
-
-async def test_all_that_was_sent_before_the_end_still_goes_out(address: str, domain: str) -> None:
-    async with ZenohRouter(address), listening(domain, connect=address) as stays:
-        async with listening(domain, connect=address) as ends:
-            await met(stays, ends)
-            for number in range(100):
-                ends.wire.publish(LIVE, b"%d" % number)
-        await until(lambda: stays.present == {})
-    assert stays.of(ends) == [Joined(""), *(b"%d" % number for number in range(100)), Left()]
 
 
 @pytest.mark.thorough
@@ -398,10 +290,6 @@ async def test_a_link_needs_the_address_of_a_router(domain: str) -> None:
             ZenohWire(domain, **options)
 
 
-async def test_a_wire_that_was_never_opened_can_be_closed(domain: str) -> None:
-    await ZenohWire(domain, connect=free_address()).close()
-
-
 def own_threads() -> int:
     return sum(thread.name == "tfbus and zenoh end" for thread in threading.enumerate())
 
@@ -543,13 +431,3 @@ async def test_a_message_that_is_too_large_is_refused_and_one_that_is_far_too_la
         kinds = [len(item) if isinstance(item, bytes) else type(item) for _, item in one.items]
         assert kinds == [MAX_MESSAGE, MalformedMessageError, 3]
         assert "oversized" in str(one.items[1][1])
-
-
-@given(st.text("ab*", min_size=1, max_size=8), st.text("ab", max_size=8))
-async def test_a_pattern_matches_as_a_plain_regular_expression_does(pattern: str, robot: str) -> None:
-    plain = re.compile(".*".join(map(re.escape, pattern.split("*"))))
-    assert Hearing(pattern, "all").matches(robot) == bool(plain.fullmatch(robot))
-
-
-async def test_a_name_that_almost_matches_a_pattern_of_many_stars_takes_no_time() -> None:
-    assert not Hearing("*a" * 100 + "*b", "all").matches("a" * 199 + "c")

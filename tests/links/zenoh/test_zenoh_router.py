@@ -6,7 +6,8 @@ import anyio
 import pytest
 import zenoh
 from support.processes import free_address, until
-from support.zenoh_wires import LIVE, Ear, Way, listening, met, start_router, talk, way_to
+from support.wires import LIVE, Ear, met
+from support.zenoh_wires import Way, listening, start_router, talk, way_to
 
 from tfbus.links.seams import Joined, Left
 from tfbus.links.zenoh import zenoh_router
