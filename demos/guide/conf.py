@@ -58,6 +58,8 @@ nitpick_ignore_regex = [
     ("py:class", r"tfbus\..*\.MalformedMessageError"),
     # The parts of a recording for code that reads it in blocks.
     ("py:class", r"tfbus\.recording\.(recording\.(Decoded)?Block|formats\.\w+\.RawTransform)"),
+    # The policy of a question that waits, which a program reads from it and never makes.
+    ("py:class", r"tfbus\.tree\.lookup\.Policy"),
     # The parts of a link, and the follower of a clock.
     ("py:class", r"tfbus\.links\.(endpoint\.(HearsTime|Endpoint)|seams\.Wire|lookups\.Serving)"),
     ("py:class", r"tfbus\._aio\.turn_budget\.TurnBudget"),
