@@ -1,15 +1,16 @@
 """The transforms in the recorded bags, read with PyPI's `rosbags` or, where that is missing, Debian's python3-rosbag.
 
-The bags are no part of this repository: they are looked for in ``../shared/data`` beside the checkout.
+The bags are no part of this repository: the environment variable ``RECORDINGS`` names the folder that has them.
 """
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from steps import SECOND
 
-FOLDER = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+FOLDER = Path(os.environ.get("RECORDINGS", "/nowhere"))
 
 Recorded = tuple[bool, str, str, int, list[float], list[float]]
 """Whether it is static, parent, child, stamp in ns, translation, rotation."""

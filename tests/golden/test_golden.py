@@ -19,7 +19,7 @@ def test_tfbus_answers_what_tf2_did_or_deviates_as_stated(theme: str) -> None:
     """Every recorded scenario; one on a bag only where the bag is."""
     bag = f"{theme}.bag"
     if theme in BAG_THEMES and not bags.is_there(bag):
-        pytest.skip(f"{bag} is not in ../shared/data beside the checkout")
+        pytest.skip(f"no {bag}: set RECORDINGS to a folder that has it")
     found = {scenario["scenario"]: list(disagreements(scenario)) for scenario in THEMES[theme]}
     assert {name: differences for name, differences in found.items() if differences} == {}
 

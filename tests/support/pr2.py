@@ -1,26 +1,22 @@
-"""A real robot, a PR2: its URDF, and a recording of its joints and of what the real robot_state_publisher made of them.
-
-The files are no part of this repository: they are looked for in ``../shared/data`` beside the checkout.
-"""
+"""A real robot, a PR2: its URDF, its recorded joints, and what the real robot_state_publisher made of them."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import pytest
 from rosbags.highlevel import AnyReader
+from support.recorded import REAL
 
 from tfbus import SECOND, Transform
 
-FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
-URDF = FOLDER / "pr2.urdf"
-BAG = FOLDER / "pr2_tf.bag"
+URDF = REAL / "pr2.urdf"
+BAG = REAL / "pr2_tf.bag"
 
 needed = pytest.mark.skipif(
     not (URDF.is_file() and BAG.is_file()),
-    reason="pr2.urdf and pr2_tf.bag are not in ../shared/data beside the checkout",
+    reason="no pr2.urdf and pr2_tf.bag: set RECORDINGS to a folder that has them",
 )
 
 

@@ -1,6 +1,7 @@
 """Recordings to read in tests: the repository's own, real ones, and files made by the writers of others."""
 
 import json
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,8 @@ from tfbus.tf_message import encode
 
 SMALL = Path(__file__).parents[1] / "recordings" / "small.bag"
 ANSWERS = SMALL.with_suffix(".json")
-REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
+REAL = Path(os.environ.get("RECORDINGS", "/nowhere"))
+"""The folder of real recordings, which are no part of this repository."""
 
 WRONG_IN_SMALL = {
     "not finite": 3,
@@ -41,7 +43,7 @@ def real(name: str) -> Path:
     """A real recording; the test is skipped where it is not there."""
     path = REAL / name
     if not path.is_file():
-        pytest.skip(f"{name} is not in ../shared/data beside the checkout")
+        pytest.skip(f"no {name}: set RECORDINGS to a folder that has it")
     return path
 
 
