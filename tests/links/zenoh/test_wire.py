@@ -259,9 +259,9 @@ from tfbus.links.seams import Hearing
 from tfbus.links.zenoh.wire import ZenohWire
 async def main(domain, which, address):
     wire = ZenohWire(domain, lease=1.0, **{which: address})
-    await wire.open([Hearing("*", "live")], lambda link, item: None, print)
+    await wire.open([Hearing("*", "all")], lambda link, item: None, print)
     while True:
-        wire.publish("live", b"beat")
+        wire.publish("all", b"beat")
         await anyio.sleep(0.02)
 anyio.run(main, *sys.argv[1:])
 """
