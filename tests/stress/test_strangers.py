@@ -147,7 +147,7 @@ def ill_questions(_: Scene) -> Iterator[bytes]:
 
 
 def question_storm(_: Scene) -> Iterator[bytes]:
-    for number in range(2_000):
+    for number in range(600):
         yield write_text(Kind.QUESTION, {"since": 0, "frames": [f"filter {number}"] if number % 2 else None})
         yield write_text(Kind.PAST_QUESTION, {"seconds": 3_600, "after": ""})
 
