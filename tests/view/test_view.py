@@ -493,6 +493,7 @@ on_one_loop = pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["
 
 
 @look
+@on_one_loop
 async def test_a_moving_frame_moves_and_a_click_shows_where_it_is(shown: Shown) -> None:
     # The camera looks at the middle, x = 5, where the tool is not at first.
     shown.bus.publish([static("map", "left", -20.0), static("map", "right", 30.0)])

@@ -272,6 +272,7 @@ async def test_of_many_strangers_the_oldest_make_room(directory: str) -> None:
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"])
 async def test_a_stranger_that_says_nothing_is_sent_away(directory: str) -> None:
     wire = LocalWire(DOMAIN, directory=directory)
     async with running(wire):

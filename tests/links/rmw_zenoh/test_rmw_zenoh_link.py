@@ -295,6 +295,7 @@ async def test_a_node_of_another_program_both_ways_with_every_answer_right() -> 
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"])
 async def test_a_node_of_another_program_is_heard_again_when_it_is_back_and_a_link_too() -> None:
     async with router() as address:
         with Bus() as bus:
@@ -379,7 +380,7 @@ async def test_a_session_that_does_not_close_in_time_is_told(
         assert "it goes on" in caplog.text
 
 
-@pytest.mark.parametrize("cases", [300, pytest.param(10_000, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("cases", [300, pytest.param(3_000, marks=pytest.mark.thorough)])
 async def test_no_damaged_message_attachment_or_key_ends_a_link_and_each_is_counted_or_heard(
     cases: int, caplog: pytest.LogCaptureFixture
 ) -> None:
