@@ -30,7 +30,7 @@ from support.both_sides import (
     meet,
     node,
 )
-from support.processes import free_ports
+from support.processes import free_ports, new_dds_domain
 
 from tfbus import Buffer, Bus
 from tfbus.links.ros import RosLink
@@ -41,7 +41,6 @@ PEER = Path(__file__).parents[1] / "support" / "ros2_peer.py"
 MESSAGES = PEER.with_name("real_ros_messages.py")
 ROBOT = PEER.with_name("ros2_robot.py")
 CYCLONE_PEER = PEER.with_name("cyclone_peer.py")
-_next_domain = iter(range(100 + os.getpid() % 50, 200))
 
 
 def ros2_python(further: str = "") -> str:
@@ -148,14 +147,14 @@ KINDS = {"dds": "/driver", "cyclone": "/cyclone", "rosbridge": "rosbridge"}
 
 @pytest.mark.parametrize("kind", KINDS)
 async def test_both_ways_with_every_answer_right(kind: str) -> None:
-    domain = next(_next_domain)
+    domain = new_dds_domain()
     async with links(kind, domain) as (link_of, peer_of, _):
         with Bus() as bus:
             assert await meet(link_of(bus), bus, peer_of(domain)) == {KINDS[kind]}
 
 
 async def test_dds_with_nodes_of_both_kinds_both_ways_with_every_answer_right() -> None:
-    domain = next(_next_domain)
+    domain = new_dds_domain()
     async with links("dds", domain) as (link_of, peer_of, _):
         with Bus() as bus:
             # Both move the same frame in the same way.
@@ -166,7 +165,7 @@ async def test_dds_with_nodes_of_both_kinds_both_ways_with_every_answer_right() 
 @pytest.mark.parametrize("kind", ["dds", "rosbridge"])
 async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed(kind: str, tmp_path: Path) -> None:
     pytest.importorskip("urdf_parser_py", reason='pip install "tfbus[urdf]"')
-    domain = next(_next_domain)
+    domain = new_dds_domain()
     async with links(kind, domain) as (link_of, _, place):
         with robot(domain, tmp_path):
             await check_clock(link_of)
@@ -176,7 +175,7 @@ async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed(kind
 
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_node_that_is_killed_is_heard_again_when_it_is_back(kind: str) -> None:
-    domain = next(_next_domain)
+    domain = new_dds_domain()
     async with links(kind, domain) as (link_of, peer_of, _):
         with Bus() as bus:
             await check_killed_node(link_of(bus), bus, partial(peer_of, domain))
@@ -185,14 +184,14 @@ async def test_a_node_that_is_killed_is_heard_again_when_it_is_back(kind: str) -
 @pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"])
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(kind: str) -> None:
-    domain = next(_next_domain)
+    domain = new_dds_domain()
     async with links(kind, domain) as (link_of, peer_of, _):
         await check_link_that_came_back(link_of, peer_of(domain, 8.0))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_late_link_has_the_static_frames_of_ros_and_of_other_links(kind: str) -> None:
-    domain = next(_next_domain)
+    domain = new_dds_domain()
     async with links(kind, domain) as (link_of, peer_of, _):
         with peer_of(domain, 60.0), Bus() as bus, Buffer(bus) as buffer:
             Program(bus, buffer)

@@ -14,7 +14,7 @@ pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
 pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
 
-from support.processes import free_address, new_domain, until
+from support.processes import free_address, new_dds_domain, new_domain, until
 from support.rosbridge import rosbridge_server
 from support.samples import latched, moving, static
 
@@ -31,9 +31,8 @@ CHILDREN = ("ros1", "ros2", "first", "second", "third")
 
 
 @pytest.fixture
-def domain_number(request: pytest.FixtureRequest) -> int:
-    """A domain for each loop."""
-    return 210 + ["asyncio", "uvloop", "trio"].index(request.node.callspec.id)
+def domain_number() -> int:
+    return new_dds_domain()
 
 
 def buses_in(stack: AsyncExitStack) -> tuple[list[Bus], list[Counter[tuple[str, int]]]]:

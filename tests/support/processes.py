@@ -53,6 +53,16 @@ def free_address() -> str:
     return f"tcp/127.0.0.1:{free_ports(1)[0]}"
 
 
+_dds_domains = count(os.getpid())
+
+
+def new_dds_domain() -> int:
+    """A domain of DDS that is not ROS's default one, and that no other process of this run uses at the same time."""
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    return 100 + worker + next(_dds_domains) % (100 // workers) * workers
+
+
 class Place:
     """A domain of one test: on this machine, or behind the router in the process of its first member."""
 
