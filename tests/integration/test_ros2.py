@@ -30,7 +30,7 @@ from support.both_sides import (
     meet,
     node,
 )
-from support.processes import free_ports, new_dds_domain
+from support.processes import free_ports, new_dds_domain, on_one_loop
 
 from tfbus import Buffer, Bus
 from tfbus.links.ros import RosLink
@@ -181,7 +181,7 @@ async def test_a_node_that_is_killed_is_heard_again_when_it_is_back(kind: str) -
             await check_killed_node(link_of(bus), bus, partial(peer_of, domain))
 
 
-@pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"])
+@on_one_loop
 @pytest.mark.parametrize("kind", KINDS)
 async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(kind: str) -> None:
     domain = new_dds_domain()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import anyio
 import pytest
-from support.processes import PATIENCE
+from support.processes import PATIENCE, on_one_loop
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
@@ -19,7 +19,7 @@ from tfbus.links.dds.dds_link import configuration
 pytestmark = [
     pytest.mark.anyio,
     pytest.mark.thorough,
-    pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"]),
+    on_one_loop,
 ]
 
 PEER = Path(__file__).with_name("hostile_cyclone_peer.py")

@@ -19,9 +19,13 @@ from typing import IO, Any
 from uuid import uuid4
 
 import anyio
+import pytest
 
 PATIENCE = 60.0
 """Seconds; far more than anything takes."""
+
+on_one_loop = pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"])
+"""For a slow test of other programs, which do not notice which loop runs here."""
 
 _PROGRAM = Path(__file__).parent / "peer_process.py"
 _numbers = count()

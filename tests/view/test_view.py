@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("viser", reason="the live page needs viser")
 
 from anyio.lowlevel import checkpoint
-from support.processes import free_ports
+from support.processes import free_ports, on_one_loop
 from support.samples import moving, over, static
 from support.viser_pages import CLICK, Browser, PageClient, in_browser, on_page
 
@@ -489,7 +489,6 @@ async def test_a_robot_that_cannot_be_read_is_an_error_on_entering(urdf: str, er
 # In a real browser
 
 look = pytest.mark.thorough
-on_one_loop = pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"])
 
 
 @look

@@ -24,7 +24,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.local_links import RawPeer, files_in, framed
-from support.processes import OPEN_FILES, Program, until
+from support.processes import OPEN_FILES, Program, on_one_loop, until
 from support.wires import HEARS_ALL, Ear, met, running
 
 from tfbus.links.local.local_wire import MOST_STRANGERS, MOST_UNFINISHED, LocalWire
@@ -272,7 +272,7 @@ async def test_of_many_strangers_the_oldest_make_room(directory: str) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"])
+@on_one_loop
 async def test_a_stranger_that_says_nothing_is_sent_away(directory: str) -> None:
     wire = LocalWire(DOMAIN, directory=directory)
     async with running(wire):

@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from support.both_sides import SECONDS, Node, check_killed_node, check_link_that_came_back, meet, node
 from support.damage import damaged
 from support.joint_messages import joint_state
-from support.processes import free_ports, until
+from support.processes import free_ports, on_one_loop, until
 from support.samples import latched, moving, static
 
 from tfbus import Bus, PeerRejected, SimulatedClock, TransformStamped
@@ -295,7 +295,7 @@ async def test_a_node_of_another_program_both_ways_with_every_answer_right() -> 
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"])
+@on_one_loop
 async def test_a_node_of_another_program_is_heard_again_when_it_is_back_and_a_link_too() -> None:
     async with router() as address:
         with Bus() as bus:
