@@ -59,7 +59,7 @@ def test_an_expired_sample_of_a_frame_that_is_static_by_the_end_of_its_batch_is_
     live.tell_expired = lambda _sample, newest, _authority: newest > 0
     live.insert((moving("map", "a", 100), moving("map", "b", 100)))
     live.insert((moving("map", "a", 1), moving("map", "b", 1), static("map", "b")))
-    assert (live.counters(5).expired, live.expired_ahead) == (2, 1)
+    assert (live.statistics(5).expired, live.expired_ahead) == (2, 1)
 
 
 class CountedFrames(dict[str, FrameHistory]):
@@ -99,7 +99,7 @@ def test_late_samples_that_form_a_loop_are_told_once_for_each() -> None:
     live.insert((late,))
     live.insert((moving("c", "a", 11),))
     assert told == [(late, (5, ("a", "b", "a")))]
-    assert live.counters(7).looped == 1
+    assert live.statistics(7).looped == 1
 
 
 def test_an_error_of_one_waiter_does_not_keep_others_from_being_woken() -> None:

@@ -440,7 +440,7 @@ class Lookups:
         last_reset = self.share.live.last_reset
         await checkpoint()
         wait = Wait(question, self._now(), _nothing)
-        wait.share, wait.others, wait.patience = self.share, others, patience
+        wait.others, wait.patience = others, patience
         return await self.go_on(wait, last_reset)
 
     async def go_on(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:

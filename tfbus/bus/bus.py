@@ -33,9 +33,9 @@ from tfbus.geometry.columns import Names, SampleColumns
 from tfbus.geometry.stamped import MAX_TRANSLATION, Batch, TransformStamped, as_batch, check_translations
 from tfbus.registration import Registration
 from tfbus.stamps import StampLike, StampsLike, format_stamp
-from tfbus.statistics import BusStatistics
+from tfbus.statistics import BufferStatistics, BusStatistics
 from tfbus.tree.forest import Forest, LoopingSample
-from tfbus.waiting.live_tree import Counters, LiveTree, Share
+from tfbus.waiting.live_tree import LiveTree, Share
 from tfbus.which_kernel import Intake
 
 
@@ -500,11 +500,11 @@ class Bus:
         self._check_usable()
         samples = self._samples()
         if isinstance(prefill, LiveTree):
-            live, before = prefill, prefill.counters(samples)
+            live, before = prefill, prefill.statistics(samples)
         else:
             moment = samples, self._removals + self._resets
             latched = tuple(self._topology.latched.values())
-            before = Counters(samples - len(latched))
+            before = BufferStatistics(samples - len(latched), 0, 0, 0, 0)
             trees = self._trees.items() if prefill is None else ()
             known = next((live for live, since in trees if since == moment and live.forest.window == window), None)
             live = known or LiveTree(prefill or Forest(window), self._announce_past_loop)

@@ -30,10 +30,10 @@ import logging
 import math
 from bisect import bisect_left, insort
 from collections.abc import Callable, Container, Hashable, Iterable, KeysView
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from itertools import count, takewhile
 from operator import sub
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 from weakref import ref
 
 from tfbus._python_kernel import Place
@@ -463,18 +463,6 @@ def _discard(places: list[Place], place: Place) -> None:
         del places[i]
 
 
-class Counters(NamedTuple):
-    """The samples that a bus has published, and those of one tree, as `BufferStatistics` explains them."""
-
-    offered: int
-    inserted: int = 0
-    replaced: int = 0
-    expired: int = 0
-    expired_ahead: int = 0
-    superseded: int = 0
-    looped: int = 0
-
-
 class LiveTree:
     """The part of one or several buffers that their bus calls.
 
@@ -595,12 +583,12 @@ class LiveTree:
         _wake(self.waiting.pop_all())
         _wake(self.watching.reset(self.last_reset))
 
-    def counters(self, samples: int) -> Counters:
-        """The counters now, given the number of samples that the bus has published."""
-        forest, superseded = self.forest, self.superseded
+    def statistics(self, samples: int, waiting: int = 0) -> BufferStatistics:
+        """All counters, given the number of samples that the bus has published and of lookups that wait."""
+        forest, ahead, superseded = self.forest, self.expired_ahead, self.superseded
         expired = forest.expired + superseded
-        return Counters(
-            samples, forest.inserted, forest.replaced, expired, self.expired_ahead, superseded, forest.looped
+        return BufferStatistics(
+            samples, forest.inserted, forest.replaced, expired, waiting, ahead, superseded, forest.looped
         )
 
     def keep_for(self, *readers: "ReadsForest") -> None:
@@ -681,7 +669,7 @@ class Share:
     Parameters
     ----------
     live : LiveTree
-    before : Counters
+    before : BufferStatistics
         The counters of the bus and of the tree before the buffer joined; its own go on from there.
 
     Attributes
@@ -691,7 +679,7 @@ class Share:
         The reason why no more samples will come; None while they may.
     """
 
-    def __init__(self, live: LiveTree, before: Counters) -> None:
+    def __init__(self, live: LiveTree, before: BufferStatistics) -> None:
         self.live = live
         self.end_reason: str | None = None
         self._end_callbacks: dict[Registration, Callable[[], object]] = {}
@@ -748,9 +736,8 @@ class Share:
 
     def statistics(self, samples: int) -> BufferStatistics:
         """The counters since the buffer joined, given the number of samples that its bus has published by now."""
-        offered, inserted, replaced, expired, *others = map(sub, self.live.counters(samples), self._before)
-        waiting = len(self.waiters)
-        return BufferStatistics(offered, inserted, replaced, expired, waiting, *others)
+        now = self.live.statistics(samples, len(self.waiters))
+        return BufferStatistics(*map(sub, astuple(now), astuple(self._before)))
 
 
 def _wake(waiters: Iterable[Waiter | WatchState]) -> None:

@@ -297,7 +297,9 @@ class _Session:
     def let_leave(self, now: float) -> float | None:
         """Tell of links that have left; returns the s until the next look at the session, None if a change is first."""
         left = self.hearer.let_leave(now)
-        return left if self._neighbours is None else min(PERIOD, PERIOD if left is None else left)
+        if self._neighbours is None:
+            return left
+        return PERIOD if left is None else min(left, PERIOD)
 
     def begin(self, domain: str, number: int, hears: Sequence[Hearing], *, is_router: bool) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
