@@ -3,9 +3,10 @@
 The environment variable ``TFBUS_KERNEL`` asks for ``python`` or ``compiled``. Without it, the compiled kernel runs if
 it was built and can be loaded.
 
-`tfbus._python_kernel` is the definition: ``_c_kernel/`` does the same, with the same bits. The fast path of publishing
-exists in C only, because in Python it would not be faster than the ordinary path: `Intake` takes a plain batch, and the
-`Feed` of each buffer stores it and wakes the lookups that waited for it.
+`tfbus._python_kernel` is the definition: ``_c_kernel/`` does the same, with the same bits. The fast paths of publishing
+and waiting exist in C only, because in Python they would not be faster than the ordinary ones: `Intake` takes a plain
+batch, and the `Feed` of each tree stores it and wakes the lookups that waited for it. Another `Feed`, of each buffer,
+asks and parks the plain ones.
 """
 
 import functools
