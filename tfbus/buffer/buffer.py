@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Any, SupportsIndex, TypeVar
 
-from tfbus._aio.loops import checkpoint, on_asyncio
+from tfbus._aio.loops import checkpoint
 from tfbus.buffer.lookups import LocalNames, Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
@@ -122,7 +122,7 @@ class Buffer:
     def _stand_on(self, forest: Forest) -> None:
         self._forest = self._lookups.forest = forest
         self._paths = forest.paths if self._local_names is None else forest.local_paths()
-        self._paths.now = self.bus.clock.now
+        self._paths.now = self._lookups.now
         plain = self._local_names is None and self._lookups.has_alarms and forest is self._share.live.forest
         self._feed = self._lookups.feed if plain else None
 
@@ -257,13 +257,10 @@ class Buffer:
             return await self._lookups.lookup(self._on_bus(question), timeout)
         live = self._share.live
         last_reset = live.last_reset
-        turn = on_asyncio()
-        wait = self._feed.ask(target, source, at, turn)
+        wait = self._feed.ask(target, source, at)
         if timeout is not None:
             wait.patience = as_duration(timeout, "timeout")
         try:
-            if not turn:
-                await checkpoint()
             await wait
             found: TransformStamped | None = wait.answer
             if found is None or live.last_reset is not last_reset:
