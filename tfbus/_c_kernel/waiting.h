@@ -535,13 +535,21 @@ feed_edge(const Feed *self, const Parked *waiter, int64_t *at, int64_t *limit)
     return failed || *limit < passed ? NULL : edge;
 }
 
-/* ask(target, source, at): a lookup to be awaited, once. */
+/* ask(target, source, at, timeout): a lookup to be awaited, once. None if the timeout is neither None nor a float in s. */
 static PyObject *
 feed_ask(Feed *self, PyObject *const *args, Py_ssize_t nargs)
 {
-    if (nargs != 3 || self->parts[KIND] == NULL || self->parts[HERE] == NULL) {
-        PyErr_SetString(PyExc_TypeError, "ask takes target, source and at, after kind and here");
+    if (nargs != 4 || self->parts[KIND] == NULL || self->parts[HERE] == NULL) {
+        PyErr_SetString(PyExc_TypeError, "ask takes target, source, at and a timeout, after kind and here");
         return NULL;
+    }
+    double patience = Py_HUGE_VAL;
+    if (args[3] != Py_None) {
+        patience = PyFloat_CheckExact(args[3]) ? PyFloat_AsDouble(args[3]) : -1.0;
+        /* Not `<`, which is false for NaN. */
+        if (!(patience >= 0.0)) {
+            Py_RETURN_NONE;
+        }
     }
     PyObject *name = PyObject_GetAttr(self->parts[HERE], name_string);
     if (name == NULL) {
@@ -557,7 +565,7 @@ feed_ask(Feed *self, PyObject *const *args, Py_ssize_t nargs)
     made->asked = question;
     Py_INCREF(OBJECT(self));
     made->feed = OBJECT(self);
-    made->patience = Py_HUGE_VAL;
+    made->patience = patience;
     made->on_asyncio = name == Py_None;
     made->step = BEFORE_TURN;
     return OBJECT(made);
@@ -948,7 +956,8 @@ feed_insert(Feed *self, PyObject *batch)
 
 static PyMethodDef feed_methods[] = {
     {"ask", FAST(feed_ask), METH_FASTCALL,
-     PyDoc_STR("ask(target, source, at): a lookup to be awaited, once; then it has its answer, or Python has to go on.")},
+     PyDoc_STR("ask(target, source, at, timeout): a lookup to be awaited, once; then it has its answer, or Python has to "
+               "go on. None if the timeout is neither None nor a float that is a duration.")},
     {"insert", (PyCFunction)feed_insert, METH_O,
      PyDoc_STR("insert(batch): store a batch and wake the lookups that it has unblocked, if all is plain; else do "
                "nothing.")},

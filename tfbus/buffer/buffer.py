@@ -257,9 +257,9 @@ class Buffer:
             return await self._lookups.lookup(self._on_bus(question), timeout)
         live = self._share.live
         last_reset = live.last_reset
-        wait = self._feed.ask(target, source, at)
-        if timeout is not None:
-            wait.patience = as_duration(timeout, "timeout")
+        wait = self._feed.ask(target, source, at, timeout)
+        if wait is None and timeout is not None:
+            wait = self._feed.ask(target, source, at, as_duration(timeout, "timeout"))
         try:
             await wait
             found: TransformStamped | None = wait.answer

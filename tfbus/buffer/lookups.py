@@ -22,7 +22,6 @@ import sys
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from heapq import heapify, heappop, heappush
 from itertools import count
 from time import time_ns
@@ -219,11 +218,9 @@ class AlarmHeap:
     def __init__(self, loop: Any) -> None:
         self.timer = LoopTimer(loop, self._ring)
         self._now = self.timer.now
-        self._alarms: list[tuple[float, int]] = []
+        # With a list of the callback, which is empty once the call is made or cancelled.
+        self._alarms: list[tuple[float, int, list[Callable[[], object]]]] = []
         self._most = _CANCELLED_KEPT
-        # The callbacks that are neither made nor cancelled, by number.
-        self._callbacks: dict[int, Callable[[], object]] = {}
-        self._pop = self._callbacks.pop
         self._numbers = count()
 
     def __len__(self) -> int:
@@ -231,27 +228,26 @@ class AlarmHeap:
 
     def add(self, seconds: float, callback: Callable[[], object]) -> Cancel:
         due = self._now() + seconds
-        number = next(self._numbers)
-        self._callbacks[number] = callback
         alarms = self._alarms
         if len(alarms) > self._most:
-            alarms[:] = [alarm for alarm in alarms if alarm[1] in self._callbacks]
+            alarms[:] = [alarm for alarm in alarms if alarm[2]]
             heapify(alarms)
             self._most = 2 * len(alarms) + _CANCELLED_KEPT
-        heappush(alarms, (due, number))
+        made = [callback]
+        heappush(alarms, (due, next(self._numbers), made))
         if due < self.timer.due:
             self.timer.set(due)
         # No function of Python, because nearly every wait cancels its alarms before it gives its answer.
-        return partial(self._pop, number, None)
+        return made.clear
 
     def _ring(self) -> None:
         """Make the calls that are due, and set the timer for the next."""
         now = self.timer.now()
         try:
-            while self._alarms and (self._alarms[0][0] <= now or self._alarms[0][1] not in self._callbacks):
-                callback = self._callbacks.pop(heappop(self._alarms)[1], None)
-                if callback is not None:
-                    callback()
+            while self._alarms and (self._alarms[0][0] <= now or not self._alarms[0][2]):
+                made = heappop(self._alarms)[2]
+                if made:
+                    made.pop()()
         finally:
             if self._alarms and self._alarms[0][0] < self.timer.due:
                 self.timer.set(self._alarms[0][0])
