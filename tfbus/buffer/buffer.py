@@ -9,11 +9,12 @@ from tfbus.buffer.lookups import LocalNames, Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
 from tfbus.data import Stamped, do_transform
-from tfbus.errors import ExtrapolationError, TransformLookupError
+from tfbus.errors import TransformLookupError
 from tfbus.frames import as_prefix, is_frame
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.registration import Registration
 from tfbus.stamps import LATEST, AtLike, as_at, as_duration
+from tfbus.tf2_names import says_ours
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
@@ -29,6 +30,7 @@ _DESCRIBED = 10
 """The number of waiting lookups that `describe` shows; each may have to search all frames for similar names."""
 
 
+@says_ours
 class Buffer:
     """A few seconds of every frame on a bus, and the transforms between them.
 
@@ -183,8 +185,8 @@ class Buffer:
             found = answer(self._forest, above, below, at, source_at, via, bounds, policy)
             # The next such lookup is as plain as one without a prefix.
             self._forest.keep_locally(self._paths, (target, source), above, below)
-        except ExtrapolationError as error:
-            self._lookups.note_ahead(error)
+        except TransformLookupError as error:
+            self._lookups.complete(error, max_age, bounds)
             raise
         # Not `names.answer`, which costs a fifth of this lookup: the local names are at hand.
         return renamed(found, target, source)
@@ -499,8 +501,7 @@ class Buffer:
             now=self._clock.now(),
         )
         for error in found.errors:
-            if isinstance(error, ExtrapolationError):
-                self._lookups.note_ahead(error)
+            self._lookups.complete(error, max_age, bounds)
         return found if self._local_names is None else self._local_names.explanation(found, target, source)
 
     def pending(self) -> tuple[PendingLookup, ...]:

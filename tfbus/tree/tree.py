@@ -25,6 +25,8 @@ from tfbus.geometry.stamped import (
 from tfbus.geometry.transform_array import TransformArray, with_stamps
 from tfbus.stamps import (
     LATEST,
+    SECOND,
+    STAMP_MAX,
     AtLike,
     Latest,
     StampLike,
@@ -36,6 +38,7 @@ from tfbus.stamps import (
     format_stamp,
     from_seconds,
 )
+from tfbus.tf2_names import says_ours
 from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge, FrameHistory, Outcome, SavedFrame, samples_of, save_frame
@@ -46,6 +49,7 @@ from tfbus.tree.twist import twist
 from tfbus.which_kernel import plain_first
 
 
+@says_ours
 class TransformTree:
     """The transforms between any two frames, over the last few seconds.
 
@@ -672,10 +676,14 @@ def window_of(keep: float | None) -> int | None:
     Raises
     ------
     ValueError
-        If `keep` is negative or NaN.
+        If `keep` is negative or NaN, or does not fit 64-bit nanoseconds.
     """
     seconds = None if keep is None else as_duration(keep, "keep")
-    return None if seconds is None or seconds == math.inf else from_seconds(seconds)
+    if seconds is None or seconds == math.inf:
+        return None
+    if seconds > STAMP_MAX / SECOND:
+        raise ValueError(f"keep must be at most 292 years, in s, got {keep!r}: nanoseconds passed as seconds?")
+    return from_seconds(seconds)
 
 
 def _as_many(source_at: StampLike | StampsLike, count: int) -> Stamps:
