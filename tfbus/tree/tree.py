@@ -394,7 +394,17 @@ class TransformTree:
         found = lookup_many(self._forest, target, source, asked, source_stamps, fixed, out_of_range, policy)
         return with_stamps(found, asked)
 
-    def deskew(self, cloud: PointCloud, target: str, fixed: str, *, out_of_range: OutOfRange = "raise") -> PointCloud:
+    def deskew(
+        self,
+        cloud: PointCloud,
+        target: str,
+        fixed: str,
+        *,
+        out_of_range: OutOfRange = "raise",
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> PointCloud:
         """A cloud from a moving sensor, corrected as if all points had been seen at the stamp of the cloud.
 
         Each point is moved into `fixed` by the transform at its own stamp, and from there into `target` by the
@@ -411,6 +421,8 @@ class TransformTree:
         out_of_range : {"raise", "nan"}
             As for `lookup_many`; points without an answer become NaN. The stamp of the cloud itself must have an
             answer.
+        tolerance, max_gap, extrapolate
+            As `lookup`.
 
         Returns
         -------
@@ -423,8 +435,11 @@ class TransformTree:
             As for `lookup_many`.
         ValueError
             If the points have no stamps.
+        TypeError
+            If `cloud` is no `PointCloud`: ``to_points`` makes one of a `LaserScan`.
         """
-        return deskew(self._forest, cloud, target, fixed, out_of_range)
+        policy = policy_of(tolerance, max_gap, extrapolate)
+        return deskew(self._forest, cloud, target, fixed, out_of_range, policy)
 
     def twist(
         self, frame: str, reference: str, at: AtLike = LATEST, *, expressed_in: str | None = None
