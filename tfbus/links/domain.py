@@ -7,7 +7,6 @@ from time import monotonic
 from typing import Any, NamedTuple
 
 from tfbus.bus.bus import Bus
-from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
 from tfbus.links.endpoint import MAX_PEERS, Endpoint
 from tfbus.links.history import HistoryAsker, chunk_of_past
@@ -229,10 +228,6 @@ class DomainEnd(Endpoint):
         for replica in self._replicas.values():
             yield from replica.told()
 
-    def own_sample(self, frame: str, /) -> TransformStamped | None:
-        entry = self.own.entries.get(frame)
-        return None if entry is None or entry.origin != self.relay.origin else entry.sample
-
     def ways(self) -> Iterator[Way]:
         for peer in self.peers.values():
             yield from peer.paths.items()
@@ -432,7 +427,7 @@ class DomainEnd(Endpoint):
         """Note the samples of a batch in a copy; returns the samples that the relay has to judge."""
         samples = self._wanted(samples)
         rank, peer = provenance.rank, provenance.peer
-        if provenance.origin == self.relay.origin or (live and replica.note_moving(samples, rank)):
+        if live and replica.note_moving(samples, rank):
             return samples
         kept: list[ReceivedTransform] = []
         for sample in samples:
@@ -463,9 +458,8 @@ class DomainEnd(Endpoint):
         if not self._admit_number(peer, removal.sequence, 1):
             return False
         provenance = Provenance(removal.origin, removal.sequence, self, peer)
-        is_own = removal.origin == self.relay.origin
-        is_new = not is_own and replica.note(removal.frame, provenance.rank, None)
-        if is_new or is_own:
+        is_new = replica.note(removal.frame, provenance.rank, None)
+        if is_new:
             self.relay.remove(provenance, removal.frame)
         return is_new
 
