@@ -71,6 +71,13 @@ class OutgoingBatch:
     sequence: int
     samples: Sequence[TransformStamped]
 
+    def within(self, frames: Collection[str] | None) -> "OutgoingBatch | None":
+        """The part of it that is about some frames; None if it has none."""
+        if frames is None:
+            return self
+        samples = tuple(sample for sample in self.samples if sample._fields[1] in frames)
+        return OutgoingBatch(self.origin, self.sequence, samples) if samples else None
+
 
 @dataclass(frozen=True, slots=True)
 class RemovedFrame:
@@ -79,6 +86,10 @@ class RemovedFrame:
     origin: bytes
     sequence: int
     frame: str
+
+    def within(self, frames: Collection[str] | None) -> "RemovedFrame | None":
+        """The removal itself if it is of one of some frames; None if not."""
+        return self if frames is None or self.frame in frames else None
 
 
 @dataclass(slots=True)
@@ -124,13 +135,11 @@ class Outbox:
         self.pending = 0
         self._entries: list[OutgoingBatch | RemovedFrame] = []
 
-    def add_batch(self, batch: OutgoingBatch, echo: bool = False) -> None:
+    def add_batch(self, published: OutgoingBatch, echo: bool = False) -> None:
         """Add samples that were published; an echo, samples that came in by this very link, does not go out."""
-        if self.frames is not None:
-            wanted = tuple(sample for sample in batch.samples if sample.child in self.frames)
-            if not wanted:
-                return
-            batch = OutgoingBatch(batch.origin, batch.sequence, wanted)
+        batch = published.within(self.frames)
+        if batch is None:
+            return
         if not echo:
             self._entries.append(batch)
             self.pending += len(batch.samples)
@@ -142,7 +151,7 @@ class Outbox:
 
         A frame is withdrawn rather than removed if it left this bus only because its owner was lost.
         """
-        if self.frames is not None and removal.frame not in self.frames:
+        if removal.within(self.frames) is None:
             return
         goes_out = not echo and not (withdrawn and self.keeps_withdrawn)
         if goes_out:
