@@ -23,7 +23,6 @@ from tfbus.links.message import (
     MAX_TEXT,
     TEXTS,
     VERSION,
-    Entry,
     Heard,
     Kind,
     Outgoing,
@@ -37,7 +36,7 @@ from tfbus.links.message import (
     write_message,
     write_text,
 )
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch, RemovedFrame
+from tfbus.links.relay import Entry, OutgoingBatch, ReceivedBatch, RemovedFrame
 from tfbus.links.replica import Claim
 from tfbus.tf_message import MalformedMessageError, encode
 

@@ -27,7 +27,6 @@ from tfbus.links.endpoint import MAX_PEERS, MOST_AUTHORITY_TEXT
 from tfbus.links.history import MOST_HELD_SAMPLES, HistoryAsker
 from tfbus.links.local import LocalLink
 from tfbus.links.message import (
-    Entry,
     Heard,
     Kind,
     Outgoing,
@@ -38,7 +37,7 @@ from tfbus.links.message import (
     write_question,
     write_text,
 )
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch, RemovedFrame
+from tfbus.links.relay import Entry, OutgoingBatch, ReceivedBatch, RemovedFrame
 from tfbus.links.replica import MANY_ORIGINS, MOST_REMOVALS, Claim, Places, Replica, TooManyEntriesError
 from tfbus.links.seams import Hearing, Joined, Left
 

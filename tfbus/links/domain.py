@@ -19,24 +19,23 @@ from tfbus.links.message import (
     Outgoing,
     Text,
     Way,
-    can_hold,
     kind_of,
     read_fields,
     read_message,
+    sendable,
     write_message,
     write_text,
 )
 from tfbus.links.relay import (
-    OutgoingBatch,
+    Entry,
     Peer,
     Provenance,
-    Rank,
     ReceivedBatch,
     ReceivedTransform,
     RemovedFrame,
     Turn,
 )
-from tfbus.links.replica import CHUNK, Agreement, Claim, Entry, Places, Replica, TooManyEntriesError
+from tfbus.links.replica import CHUNK, Agreement, Claim, Known, Places, Replica, TooManyEntriesError
 from tfbus.links.seams import Hearing, Joined, Left, Presence, Received, Wire, WireItem
 from tfbus.stamps import as_duration
 from tfbus.tf_message import MalformedMessageError
@@ -225,18 +224,17 @@ class DomainEnd(Endpoint):
 
     keeps_withdrawn = True
 
-    def keep(self, entry: OutgoingBatch | RemovedFrame) -> None:
+    def keep(self, entry: Entry) -> None:
         rank, wanted = (entry.sequence, entry.origin), entry.within(self.frames)
         if isinstance(wanted, RemovedFrame):
             self.own.note(wanted.frame, rank, None, ours=True)
             return
         for sample in () if wanted is None else wanted.samples:
             _, child, _, _, _, static = sample._fields
-            if can_hold(sample):
-                with suppress(TooManyEntriesError):
-                    self.own.note(child, rank, sample, ours=True, settles=not static)
+            with suppress(TooManyEntriesError):
+                self.own.note(child, rank, sample, ours=True, settles=not static)
 
-    def kept(self) -> Iterator[OutgoingBatch | RemovedFrame]:
+    def kept(self) -> Iterator[Entry]:
         for replica in self._replicas.values():
             yield from replica.told()
 
@@ -247,14 +245,13 @@ class DomainEnd(Endpoint):
     def reach_changed(self) -> None:
         self.sign_soon()
 
-    def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
-        if not echo:
-            self.keep(batch)
-        return False
+    def outgoing(self, entry: Entry) -> Entry | None:
+        wanted = super().outgoing(entry)
+        return None if wanted is None else sendable(wanted, self.report.refused)
 
-    def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
-        if rank is not None:
-            self.own.note(frame, rank, None, ours=True)
+    def _follow(self, entry: Entry, goes_out: bool) -> bool:
+        if goes_out:
+            self.keep(entry)
         return False
 
     # Going out
@@ -287,7 +284,7 @@ class DomainEnd(Endpoint):
         self.send()
         claim = self.own.claim(self._now())._replace(partial=self.frames is not None)
         out = Outgoing(Kind.MEETING, self.relay.origin, 0, claim, self.time, self._reach(), self._serves)
-        entries: Sequence[OutgoingBatch | RemovedFrame] = self.own.ours(CHUNK) or ()
+        entries: Sequence[Entry] = self.own.ours(CHUNK) or ()
         try:
             message = write_message(out, entries)
         except ValueError:
@@ -455,7 +452,7 @@ class DomainEnd(Endpoint):
                 kept.append(sample)
         return kept
 
-    def _shows_moving(self, entry: Entry) -> bool:
+    def _shows_moving(self, entry: Known) -> bool:
         """Whether the bus shows the frame of an entry, and it moves."""
         is_shown = not self.drop_lost or self.relay.reaches(entry.origin)
         return is_shown and entry.sample is not None and not entry.sample.static

@@ -29,7 +29,7 @@ import enum
 import json
 import math
 import struct
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, groupby, repeat
 from sys import intern
@@ -44,7 +44,7 @@ from tfbus.errors import (
     TransformLookupError,
 )
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch, ReceivedTransform, RemovedFrame
+from tfbus.links.relay import Entry, OutgoingBatch, ReceivedBatch, ReceivedTransform, RemovedFrame
 from tfbus.links.replica import Claim
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
@@ -92,7 +92,6 @@ _BATCH, _REMOVAL = 0, 1
 _FINAL, _PARTIAL, _HAS_TIME, _SERVES = 1, 2, 4, 8
 _BUS = 16
 
-Entry = OutgoingBatch | RemovedFrame
 NOTHING = Claim(0, 0, 0)
 Way = tuple[bytes, tuple[bytes, ...]]
 """A bus that is reached, and the buses on the way there."""
@@ -206,6 +205,27 @@ def write_body(kind: Kind, body: bytes) -> bytes:
     return bytes((VERSION, kind)) + body
 
 
+def sendable(entry: Entry, refuse: Callable[[str, Exception], object]) -> Entry | None:
+    """The part of an entry that a message can hold, None for nothing; the rest is refused with its reason and error."""
+    if isinstance(entry, RemovedFrame):
+        try:
+            _head(Outgoing(Kind.LIVE, b""), [entry])
+        except ValueError as error:
+            refuse("frame name", error)
+            return None
+        return entry
+    if all(map(can_hold, entry.samples)):
+        return entry
+    kept: list[TransformStamped] = []
+    for sample in entry.samples:
+        refused = reason_not_to_send(sample)
+        if refused is None:
+            kept.append(sample)
+        else:
+            refuse(refused.reason, refused)
+    return OutgoingBatch(entry.origin, entry.sequence, kept) if kept else None
+
+
 def can_hold(sample: TransformStamped) -> bool:
     """Whether a message can hold a sample."""
     parent, child, stamp, _, authority, _ = sample._fields
@@ -235,11 +255,6 @@ def reason_not_to_send(sample: TransformStamped) -> InvalidTransformError | None
     return InvalidTransformError(
         f"an authority {why}", reason="authority", parent=sample.parent, child=sample.child, authority=sample.authority
     )
-
-
-def size_of(entry: Entry) -> int:
-    """The number of samples and removals in an entry."""
-    return len(entry.samples) if type(entry) is OutgoingBatch else 1
 
 
 def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:

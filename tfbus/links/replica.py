@@ -75,7 +75,7 @@ except ImportError:  # A Python that has it elsewhere.
     from hashlib import blake2b
 
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import OutgoingBatch, Rank, RemovedFrame
+from tfbus.links.relay import Entry, OutgoingBatch, Rank, RemovedFrame
 
 SETTLING = 1.5
 """s; a frame that moves less often than that is in the digests between its samples."""
@@ -99,7 +99,7 @@ _SPARE = 1_000
 _NEVER = -inf
 
 
-class Entry(NamedTuple):
+class Known(NamedTuple):
     """The newest statement on one frame: a sample or a removal.
 
     Attributes
@@ -178,13 +178,13 @@ class Replica:
 
     Attributes
     ----------
-    entries : dict of str to Entry
+    entries : dict of str to Known
     """
 
     def __init__(self, max_frames: int, own: bytes, places: Places | None = None) -> None:
         self._places = Places(max_frames) if places is None else places
         self._own = own
-        self.entries: dict[str, Entry] = {}
+        self.entries: dict[str, Known] = {}
         # A heap of the removals, the lowest ranks first; a removal stays in it for a while after a newer entry.
         self._removals: list[tuple[Rank, str]] = []
         self._removed = 0
@@ -223,14 +223,14 @@ class Replica:
             return False
         if settles and known is not None and known.sample is not None and known.origin == origin:
             # A frame that goes on moving.
-            self.entries[frame] = Entry(number, origin, sample, ours)
+            self.entries[frame] = Known(number, origin, sample, ours)
             self._fresh[frame] = None
             return True
         was_removed = known is not None and known.sample is None
         if known is None or known.origin != origin or was_removed is not (sample is None):
             self._count(origin, known, sample)
         self._forgive(was_removed)
-        self.entries[frame] = Entry(number, origin, sample, ours)
+        self.entries[frame] = Known(number, origin, sample, ours)
         if settles:
             self._fresh[frame] = None
         else:
@@ -263,7 +263,7 @@ class Replica:
                 or known.sample is None
             ):
                 return False
-            entries[child] = make(Entry, (number, origin, sample, False))
+            entries[child] = make(Known, (number, origin, sample, False))
             fresh[child] = None
         return True
 
@@ -279,7 +279,7 @@ class Replica:
 
     def changes(
         self, since: int, now: float, frames: Collection[str] | None = None, limit: int = CHUNK
-    ) -> tuple[list[OutgoingBatch | RemovedFrame], Claim]:
+    ) -> tuple[list[Entry], Claim]:
         """The oldest changes behind a sequence, and the claim that goes with them.
 
         A sequence that the copy has not reached gives the beginning of all that it holds: a claim since 0. Entries that
@@ -292,7 +292,7 @@ class Replica:
                 self._number(frame)
         if since > self._sequence:
             since = 0
-        found: list[OutgoingBatch | RemovedFrame] = []
+        found: list[Entry] = []
         log: Iterator[tuple[int, str]]
         if frames is None:
             log = islice(self._log, bisect_right(self._log, since, key=_first), None)
@@ -305,9 +305,9 @@ class Replica:
                     return found, Claim(since, sequence, 0, final=False)
         return found, self.claim(now, frames)._replace(since=since)
 
-    def ours(self, limit: int) -> list[OutgoingBatch | RemovedFrame] | None:
+    def ours(self, limit: int) -> list[Entry] | None:
         """All that this link brings to the domain; None if that is more than a limit."""
-        found: list[OutgoingBatch | RemovedFrame] = []
+        found: list[Entry] = []
         for frame, entry in self.entries.items():
             if entry.ours and entry.sample is not None:
                 if len(found) == limit:
@@ -315,7 +315,7 @@ class Replica:
                 found.append(_told(frame, entry))
         return found
 
-    def told(self) -> Iterator[OutgoingBatch | RemovedFrame]:
+    def told(self) -> Iterator[Entry]:
         """All entries."""
         for frame, entry in self.entries.items():
             yield _told(frame, entry)
@@ -328,13 +328,13 @@ class Replica:
             if entry.ours and entry.sample is not None and not entry.sample.static
         )
 
-    def _replaces(self, rank: Rank, sample: TransformStamped | None, known: Entry) -> bool:
+    def _replaces(self, rank: Rank, sample: TransformStamped | None, known: Known) -> bool:
         if rank != (known.number, known.origin):
             return rank > (known.number, known.origin)
         # Two samples of one batch.
         return sample is not None and known.sample is not None and sample.stamp > known.sample.stamp
 
-    def _count(self, origin: bytes, known: Entry | None, sample: TransformStamped | None) -> None:
+    def _count(self, origin: bytes, known: Known | None, sample: TransformStamped | None) -> None:
         if sample is not None and origin != self._own:
             held, most = self._places.held, self._places.max_frames
             if held.get(origin, 0) >= most or self._places.taken >= MANY_ORIGINS * most:
@@ -426,7 +426,7 @@ def _first(logged: tuple[int, str]) -> int:
     return logged[0]
 
 
-def _told(frame: str, entry: Entry) -> OutgoingBatch | RemovedFrame:
+def _told(frame: str, entry: Known) -> Entry:
     if entry.sample is None:
         return RemovedFrame(entry.origin, entry.number, frame)
     return OutgoingBatch(entry.origin, entry.number, (entry.sample,))

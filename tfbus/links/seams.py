@@ -12,6 +12,7 @@ import enum
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Any, Final, NamedTuple, Protocol
 
 from tfbus.errors import InvalidTransformError
@@ -42,20 +43,7 @@ class Hearing(NamedTuple):
 
     def matches(self, robot: str) -> bool:
         """Whether a robot has a name of the pattern; in linear time, for strangers choose the names."""
-        first, *others = self.robots.split("*")
-        if not others:
-            return robot == first
-        last = others.pop()
-        if len(robot) < len(first) + len(last) or not robot.startswith(first) or not robot.endswith(last):
-            return False
-        at, end = len(first), len(robot) - len(last)
-        for part in others:
-            # Each part may stand where it first occurs, so nothing is ever tried again.
-            at = robot.find(part, at, end)
-            if at < 0:
-                return False
-            at += len(part)
-        return True
+        return fnmatchcase(robot, self.robots)
 
 
 @dataclass(frozen=True, slots=True)
