@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import nullcontext, suppress
 from math import inf
 from time import monotonic
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, TypedDict
 
 from tfbus.bus.bus import Bus
 from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
@@ -36,7 +36,7 @@ from tfbus.links.relay import (
     Turn,
 )
 from tfbus.links.replica import CHUNK, Agreement, Claim, Known, Places, Replica, TooManyEntriesError
-from tfbus.links.seams import Hearing, Joined, Left, Presence, Received, Wire, WireItem
+from tfbus.links.seams import Hearing, Joined, Left, Received, Wire, WireItem
 from tfbus.stamps import as_duration
 from tfbus.tf_message import MalformedMessageError
 
@@ -143,8 +143,7 @@ class DomainEnd(Endpoint):
         self._questions: dict[tuple[str, Kind], bytes] = {}
         self._answers_due = -inf
         self._waiting: dict[str, Joined] = {}
-        self._signed_at = -inf
-        self._hurries = False
+        self._signed_at = self._sign_due = -inf
         self._sign_period = SIGN_PERIOD
 
     # For the link
@@ -212,8 +211,7 @@ class DomainEnd(Endpoint):
 
     def sign_soon(self) -> None:
         """Sign in the next turn of the event loop, or `SOONEST_SIGN` after the last sign."""
-        self._hurries = True
-        self.host.stir()
+        self._sign_within(SOONEST_SIGN)
 
     def serve(self, server: BufferServer | None) -> None:
         """Serve a buffer, or none any more."""
@@ -264,14 +262,14 @@ class DomainEnd(Endpoint):
         period = max(SIGN_PERIOD, SIGN_PERIOD_EACH * len(self.peers))
         if period < self._sign_period:
             self._sign_period = period
-            self.host.stir()
+            self._sign_within(period)
 
-    @property
-    def _sign_due(self) -> float:
-        return self._signed_at + (SOONEST_SIGN if self._hurries else self._sign_period)
+    def _sign_within(self, seconds: float) -> None:
+        self._sign_due = min(self._sign_due, self._signed_at + seconds)
+        self.host.stir()
 
     def _sign(self, now: float) -> None:
-        self._signed_at, self._hurries = now, False
+        self._signed_at, self._sign_due = now, now + self._sign_period
         self.send()
         self._channels.sign(self.own, now, self._reach(), self._serves)
 
@@ -301,28 +299,27 @@ class DomainEnd(Endpoint):
                 return
             urgent = kind in _URGENT
             received = Received(link, item, len(item), kind is Kind.LIVE, urgent, kind in _FOLLOWS)
-        elif isinstance(item, Left):
-            received = Received(link, Presence.LEFT, urgent=True)
         else:
-            received = Received(link, item, urgent=isinstance(item, Joined))
+            received = Received(link, item, urgent=isinstance(item, (Joined, Left)))
         self.host.receive(received)
 
+    def _joined(self, sender: str, joined: Joined) -> None:
+        peer = self._join(sender, joined.robot)
+        if peer is not None:
+            peer.rate = next((rate for one, rate in self._rates.items() if one.matches(peer.robot)), inf)
+            self._meet(peer)
+            self._sign_sooner()
+            # A robot of rate 0 only answers lookups.
+            if peer.rate:
+                # A peer hears of a filter by the first question.
+                self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
+                self._history.joined(sender)
+            self.host.stir()
+        elif sender not in self.peers and len(self._waiting) < MOST_WAITING:
+            self._waiting[sender] = joined
+
     def _take(self, sender: str, content: Any) -> None:
-        if isinstance(content, Joined):
-            peer = self._join(sender, content.robot)
-            if peer is not None:
-                peer.rate = next((rate for one, rate in self._rates.items() if one.matches(peer.robot)), inf)
-                self._meet(peer)
-                self._sign_sooner()
-                # A robot of rate 0 only answers lookups.
-                if peer.rate:
-                    # A peer hears of a filter by the first question.
-                    self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
-                    self._history.joined(sender)
-                self.host.stir()
-            elif sender not in self.peers and len(self._waiting) < MOST_WAITING:
-                self._waiting[sender] = content
-        elif isinstance(content, _Due):
+        if isinstance(content, _Due):
             self._answer_due(sender, content)
         elif isinstance(content, Text):
             self._take_text(sender, content)
@@ -539,7 +536,7 @@ class DomainEnd(Endpoint):
         super()._leave(sender)
         if self._waiting and len(self.peers) < MAX_PEERS:
             link = next(iter(self._waiting))
-            self._take(link, self._waiting.pop(link))
+            self._joined(link, self._waiting.pop(link))
 
     def _lose(self, peer: Peer) -> tuple[str, ...]:
         self._end_history(peer.id, peer)
@@ -627,7 +624,7 @@ class DomainEnd(Endpoint):
         seconds, after = fields.get("seconds"), fields.get("after")
         if isinstance(seconds, bool) or not isinstance(seconds, (int, float)) or not isinstance(after, str):
             raise MalformedMessageError("text", "a question for the past without a time and a name")
-        entries, final = chunk_of_past(self.bus, self.relay, self.own, seconds, after)
+        entries, final = chunk_of_past(self.bus, self.own, seconds, after)
         out = Outgoing(Kind.PAST, self.relay.origin, 0, Claim(0, 0, 0, final))
         self._wire.send(sender, write_message(out, entries))
 
@@ -688,11 +685,8 @@ class DomainEnd(Endpoint):
             self._replicas.pop(robot).forget()
 
 
-class _Due(NamedTuple):
+class _Due(Text):
     """A question whose turn has come."""
-
-    kind: Kind
-    data: bytes
 
 
 def check_name(what: str, name: str, pattern: str, letters: str) -> str:

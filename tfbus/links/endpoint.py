@@ -16,7 +16,7 @@ from tfbus.bus.subscribers import OnceLogger, SeenKeys
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.relay import REMEMBERED_REASONS, Entry, Outbox, Peer, RemovedFrame, Turn, relay_of
-from tfbus.links.seams import Carrier, Presence, Received, SendReport, Wire
+from tfbus.links.seams import Carrier, Joined, Left, Received, SendReport, Wire
 from tfbus.tf_message import MalformedMessageError
 
 MAX_PEERS = 1_000
@@ -185,9 +185,9 @@ class Endpoint(Outbox):
     def handle(self, sender: str, content: Any) -> None:
         """Handle a part of an item; nothing in it makes this raise."""
         try:
-            if content is Presence.JOINED:
-                self._join(sender)
-            elif content is Presence.LEFT:
+            if isinstance(content, Joined):
+                self._joined(sender, content)
+            elif isinstance(content, Left):
                 self._leave(sender)
             elif isinstance(content, MalformedMessageError):
                 self.reject(sender, content.reason, content)
@@ -231,7 +231,11 @@ class Endpoint(Outbox):
         """Forget the frames of a lost peer; returns them, sorted."""
         raise NotImplementedError
 
-    def _join(self, sender: str, robot: str = "") -> Peer | None:
+    def _joined(self, sender: str, joined: Joined) -> None:
+        """Note that a peer is there."""
+        self._join(sender, joined.robot)
+
+    def _join(self, sender: str, robot: str) -> Peer | None:
         """Note that a peer is there; returns it if that is new, and there is a place."""
         if sender not in self.peers and len(self.peers) >= MAX_PEERS:
             # A peer that has never announced itself has to make room.

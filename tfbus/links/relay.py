@@ -369,11 +369,6 @@ class Relay:
         if self._passed is not None:
             self._passed.forget_moving()
 
-    def newest_number(self, frame: str) -> Rank | None:
-        """Number and origin of the newest batch with a frame; None if the frame is not there."""
-        latest = self._latest.get(frame)
-        return None if latest is None else latest.rank
-
     def is_plausible(self, number: int) -> bool:
         """Whether a number may be one that a bus has given by now.
 
