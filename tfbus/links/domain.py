@@ -136,7 +136,6 @@ class DomainEnd(Endpoint):
         self._agreement = Agreement()
         self._history = HistoryAsker(history or 0.0, self._ask_past, now)
         self.lookups = RemoteLookups(wire.send, name)
-        self._news: dict[str, bool] = {}
         # The last sign of each peer that agrees with this link: the same sign once more need not wake the event loop.
         self._resting: dict[str, bytes] = {}
         # Answering takes half of the event loop's time at most.
@@ -368,70 +367,75 @@ class DomainEnd(Endpoint):
         self._take_held(peer, heard)
 
     def _take_held(self, peer: Peer, heard: Heard) -> None:
-        now = self._now()
-        live = heard.kind is Kind.LIVE
-        numbered = not heard.continues and (live or heard.kind is Kind.SIGN)
+        now, kind = self._now(), heard.kind
+        live = kind is Kind.LIVE
+        numbered = not heard.continues and kind in (Kind.LIVE, Kind.SIGN)
         is_gap = numbered and self._count_gap(peer, heard.number, live)
-        if is_gap or not live:
-            self._resting.pop(peer.id, None)
         if is_gap:
             self._agreement.missed(peer.id, now)
+        if is_gap or not live:
+            self._resting.pop(peer.id, None)
             self.host.stir()
-        if heard.kind is Kind.PAST:
-            self._take_past(peer, heard)
+        if kind is Kind.PAST and peer.id not in self._history.open:
             return
-        news = self._take_entries(peer, heard, live)
-        if heard.kind is Kind.ANSWER:
-            news = self._news.pop(peer.id, False) or news
-            if heard.goes_on:
-                self._news[peer.id] = news
-            else:
-                self._agreement.answered(peer.id, heard.claim, news, now)
-        elif not heard.goes_on and not live:
-            is_much = heard.kind is Kind.MEETING and not heard.continues and not heard.entries
+        peer.news = self._take_entries(peer, heard) or (heard.continues and peer.news)
+        if live or heard.goes_on:
+            return
+        if kind is Kind.PAST:
+            if not self._history.goes_on(peer.id, heard):
+                self._end_history(peer.id)
+        elif kind is Kind.ANSWER:
+            self._agreement.answered(peer.id, heard.claim, peer.news, now)
+        else:
+            is_much = kind is Kind.MEETING and not heard.continues and not heard.entries
             self._agreement.told(peer.id, heard.claim, now, soon=is_much)
-        if not live:
-            self.host.stir()
 
-    def _take_entries(self, peer: Peer, heard: Heard, live: bool) -> bool:
-        """Note and publish the entries of a message; returns whether any of them was new to the copy."""
+    def _take_entries(self, peer: Peer, heard: Heard) -> bool:
+        """Note and publish the entries of a message; returns whether any of them was news."""
         for error in heard.errors:
             self.reject(peer.id, error.reason, error)
-        replica = self._replica_of(peer.robot)
+        replica, live = self._replica_of(peer.robot), heard.kind is Kind.LIVE
         news = False
         together: list[tuple[Provenance, list[ReceivedTransform]]] = []
         for entry in heard.entries:
+            if isinstance(entry, RemovedFrame) and entry.within(self.frames) is None:
+                continue
+            assert entry.origin is not None
+            size = len(entry.samples) if isinstance(entry, ReceivedBatch) else 1
+            if not self.relay.is_plausible(entry.sequence):
+                # It would make all later numbers of its origin old.
+                why = f"a batch with the number {entry.sequence}, which is too far ahead of all others"
+                self.reject(peer.id, "number", ValueError(why), size)
+                continue
+            provenance = Provenance(entry.origin, entry.sequence, self, peer)
             if isinstance(entry, ReceivedBatch):
-                assert entry.origin is not None
-                size = len(entry.samples)
-                if not self._admit_number(peer, entry.sequence, size):
-                    continue
                 # The authorities of a bus beyond the peer do not count as the peer's.
                 others = entry.origin not in peer.paths
                 if not others and not self._admit_authorities(peer, entry.authorities, size):
                     continue
-                provenance = Provenance(entry.origin, entry.sequence, self, peer)
-                samples = self._note(replica, provenance, entry.samples, live)
-                news = news or (bool(samples) and not live)
+                samples = self._wanted(entry.samples)
+                if heard.kind is not Kind.PAST:
+                    samples = self._note(replica, provenance, samples, live)
+                news = news or bool(samples)
                 together.append((provenance, samples))
                 # The batches of an answer were never one batch, but nothing is between them.
                 if not live:
                     continue
-            self._publish(peer, together, live)
+            self._publish(peer, together, heard.kind)
             together.clear()
             if self.bus.closed:
                 # A subscriber may have closed it since the last entry.
                 return news
-            if isinstance(entry, RemovedFrame):
-                news = self._take_removal(peer, replica, entry) or news
-        self._publish(peer, together, live)
+            if isinstance(entry, RemovedFrame) and replica.note(entry.frame, provenance.rank, None):
+                self.relay.remove(provenance, entry.frame)
+                news = True
+        self._publish(peer, together, heard.kind)
         return news
 
     def _note(
         self, replica: Replica, provenance: Provenance, samples: list[ReceivedTransform], live: bool
     ) -> list[ReceivedTransform]:
         """Note the samples of a batch in a copy; returns the samples that the relay has to judge."""
-        samples = self._wanted(samples)
         rank, peer = provenance.rank, provenance.peer
         if live and replica.note_moving(samples, rank):
             return samples
@@ -458,23 +462,10 @@ class DomainEnd(Endpoint):
         frames = self.frames
         return samples if frames is None else [sample for sample in samples if sample._fields[1] in frames]
 
-    def _take_removal(self, peer: Peer, replica: Replica, removal: RemovedFrame) -> bool:
-        if removal.within(self.frames) is None or not self._admit_number(peer, removal.sequence, 1):
-            return False
-        provenance = Provenance(removal.origin, removal.sequence, self, peer)
-        is_new = replica.note(removal.frame, provenance.rank, None)
-        if is_new:
-            self.relay.remove(provenance, removal.frame)
-        return is_new
-
     def _publish(
-        self,
-        peer: Peer,
-        batches: Sequence[tuple[Provenance, Sequence[ReceivedTransform]]],
-        live: bool,
-        past: bool = False,
+        self, peer: Peer, batches: Sequence[tuple[Provenance, Sequence[ReceivedTransform]]], kind: Kind
     ) -> None:
-        if not live and not past and self._history.open:
+        if self._history.open and kind not in (Kind.LIVE, Kind.PAST):
             # The newest sample of a moving frame would make its past no news.
             batches = [(source, [sample for sample in samples if sample.static]) for source, samples in batches]
         if self.drop_lost:
@@ -485,17 +476,9 @@ class DomainEnd(Endpoint):
         offered = sum(len(samples) for _, samples in batches)
         if not offered:
             return
-        with nullcontext() if live else self.bus._kept_samples():
+        with nullcontext() if kind is Kind.LIVE else self.bus._kept_samples():
             published, refused = self.relay.publish(batches, self.max_frames)
         self._count(peer.id, offered, published, refused)
-
-    def _admit_number(self, peer: Peer, number: int, count: int) -> bool:
-        """Refuse a number that no bus can have reached; it would make all later numbers of its origin old."""
-        if self.relay.is_plausible(number):
-            return True
-        error = ValueError(f"a batch with the number {number}, which is too far ahead of all others")
-        self.reject(peer.id, "number", error, count)
-        return False
 
     def _count_gap(self, peer: Peer, number: int, live: bool) -> bool:
         """Count the live messages that are missing before this number; returns whether there are any."""
@@ -551,7 +534,6 @@ class DomainEnd(Endpoint):
         self._end_history(peer.id)
         self._agreement.left(peer.id)
         self.lookups.left(peer.id)
-        self._news.pop(peer.id, None)
         self._resting.pop(peer.id, None)
         self._forget_robots(peer.robot)
         lost = {bus for bus in peer.paths if self.relay.way_closed(bus)}
@@ -591,7 +573,7 @@ class DomainEnd(Endpoint):
             for entry in replica.entries.values()
             if (buses is None or entry.origin in buses) and isinstance(entry.sample, ReceivedTransform)
         ]
-        self._publish(peer, batches, live=False)
+        self._publish(peer, batches, Kind.ANSWER)
 
     # Answers
 
@@ -630,23 +612,6 @@ class DomainEnd(Endpoint):
 
     def _ask_past(self, peer: str, seconds: float, after: str) -> None:
         self._wire.send(peer, write_text(Kind.PAST_QUESTION, {"seconds": seconds, "after": after}))
-
-    def _take_past(self, peer: Peer, heard: Heard) -> None:
-        if peer.id not in self._history.open:
-            return
-        goes_on = heard.goes_on
-        try:
-            batches: list[tuple[Provenance, list[ReceivedTransform]]] = []
-            for entry in heard.entries:
-                if isinstance(entry, ReceivedBatch) and self._admit_number(peer, entry.sequence, len(entry.samples)):
-                    assert entry.origin is not None
-                    source = Provenance(entry.origin, entry.sequence, self, peer)
-                    batches.append((source, self._wanted(entry.samples)))
-            self._publish(peer, batches, live=False, past=True)
-            goes_on = goes_on or self._history.goes_on(peer.id, heard)
-        finally:
-            if not goes_on:
-                self._end_history(peer.id)
 
     def _end_history(self, peer: str, lost: Peer | None = None) -> None:
         """Stop waiting for the past of a peer, and publish its live messages that were held back."""

@@ -212,6 +212,8 @@ class Peer:
         The time of the newest samples that it has sent by such a rate, in s.
     number : int
         The number of its newest live message; 0 before the first.
+    news : bool
+        Whether a message of it that is being handled has brought news.
     authorities : set of str
         The authorities whose samples it has sent.
     authority_text : int
@@ -230,6 +232,7 @@ class Peer:
     rate: float = inf
     thinned: float = -inf
     number: int = 0
+    news: bool = False
     authorities: set[str] = field(default_factory=set)
     authority_text: int = 0
     frames: set[str] = field(default_factory=set)
