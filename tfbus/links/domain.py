@@ -437,8 +437,6 @@ class DomainEnd(Endpoint):
     ) -> list[ReceivedTransform]:
         """Note the samples of a batch in a copy; returns the samples that the relay has to judge."""
         rank, peer = provenance.rank, provenance.peer
-        if live and replica.note_moving(samples, rank):
-            return samples
         kept: list[ReceivedTransform] = []
         for sample in samples:
             _, child, _, _, _, static = sample._fields
