@@ -39,7 +39,7 @@ from tfbus.links.dds.readers import PATIENCE, RETRY, Greeting, Publishers, Reade
 from tfbus.links.dds.types import RawClock, RawEntitiesInfo, RawJointState, RawString, RawTFMessage
 from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, as_domain, settings_of
-from tfbus.links.seams import Presence, Received
+from tfbus.links.seams import Joined, Left, Received
 from tfbus.tf_message import MalformedMessageError, encode
 
 Discovery = Literal["localhost", "subnet"]
@@ -365,9 +365,9 @@ class DdsCarrier(RosCarrier):
         present = frozenset().union(*self._matched.values())
         self._publishers.keep_only(set(present))
         for participant in sorted(present - self._present):
-            self._receive(Received(participant, Presence.JOINED))
+            self._receive(Received(participant, Joined()))
         for participant in sorted(self._present - present):
-            self._receive(Received(participant, Presence.LEFT))
+            self._receive(Received(participant, Left()))
         self._present = present
         greeting = self._greetings.get(number)
         return None if greeting is None else greeting.update(frozenset(each.key.hex for each in publications))
