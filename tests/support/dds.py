@@ -63,7 +63,7 @@ class DdsNode:
     def writer(self, topic: str, kind: Any = RawTFMessage) -> Any:
         """The writer of a topic, as it is called in DDS."""
         if topic not in self._writers:
-            latched = topic in ("rt/tf_static", "rt/robot_description", "ros_discovery_info")
+            latched = topic.endswith("/tf_static") or topic in ("rt/robot_description", "ros_discovery_info")
             made = DataWriter(self.participant, Topic(self.participant, topic, kind), LATCHED if latched else MOVING)
             self._writers[topic] = made
             self._stack.callback(self.silence, topic)
