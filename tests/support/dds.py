@@ -42,12 +42,15 @@ class DdsNode:
         The domain.
     user_data : bytes
         ROS 2 gives ``enclave=...``.
+    name : str
+        Of the participant; none if it is empty.
     """
 
-    def __init__(self, number: int, user_data: bytes = b"") -> None:
+    def __init__(self, number: int, user_data: bytes = b"", name: str = "") -> None:
         self._stack = ExitStack()
         self._stack.enter_context(domain(number, CONFIG))
-        self.participant = DomainParticipant(number, Qos(Policy.Userdata(user_data)))
+        named = [Policy.EntityName(name)] if name else []
+        self.participant = DomainParticipant(number, Qos(Policy.Userdata(user_data), *named))
         self._stack.callback(self.participant.__del__)
         self.id: str = self.participant.guid.hex
         self._writers: dict[str, Any] = {}
