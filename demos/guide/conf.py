@@ -80,6 +80,9 @@ html_copy_source = False
 html_show_copyright = False
 html_theme_options = {"navigation_with_keys": True}
 
+# It would make one dash of the two before an option.
+smartquotes = False
+
 # The anchors that GitHub gives to headings, so that a link works there and here.
 myst_heading_anchors = 3
 
