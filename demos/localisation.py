@@ -75,7 +75,7 @@ async def compare(name: str, place: Place, post_date: float = 0.0) -> None:
             tasks.start_soon(localise, bus, post_date)
             await simulate(clock, scan)
             tasks.cancel_scope.cancel()
-    print(f"{name:25} at most {1000 * max(late):3.0f} ms late, at most {1000 * max(wrong):4.1f} mm wrong")
+    print(f"{name:26} at most {1000 * max(late):3.0f} ms late, at most {1000 * max(wrong):4.1f} mm wrong")
 
 
 async def main() -> None:

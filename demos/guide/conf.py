@@ -215,8 +215,10 @@ def summaries() -> str:
         for kind, name in re.findall(r"^\.\. auto(\w+):: (tfbus[\w.]+)", text, re.MULTILINE):
             # The docstring of data is the one of their type.
             summary = "" if kind == "data" else (inspect.getdoc(find(name)) or "").partition("\n\n")[0]
-            lines.append(f"* :obj:`{name}`: " + re.sub(r"(?<!`)`([^`]+)`(?!`)", r"``\1``", " ".join(summary.split())))
-        parts.append(f"{title}\n{'-' * len(title)}\n\n" + "\n".join(lines).replace(": \n", "\n") + "\n")
+            summary = re.sub(r"(?<!`)`([^`]+)`(?!`)", r"``\1``", " ".join(summary.split()))
+            lines.append(f"* :obj:`{name}`" + (f": {summary}" if summary else ""))
+        title = f":doc:`{title} <{page}>`"
+        parts.append(f"{title}\n{'-' * len(title)}\n\n" + "\n".join(lines) + "\n")
     return "\n\n" + "\n".join(parts)
 
 

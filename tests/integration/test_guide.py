@@ -102,9 +102,13 @@ def test_every_program_prints_what_the_page_says(page: Path, block: Block, capsy
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_excerpt_is_from_a_demo(page: Path) -> None:
-    demos = [path.read_text() for path in (ROOT / "demos").glob("*.py")]
+    demos = [without_indent(path.read_text()) for path in (ROOT / "demos").glob("*.py")]
     for excerpt in re.findall(r"^```py\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
-        assert any(excerpt in demo for demo in demos), excerpt
+        assert any(without_indent(excerpt) in demo for demo in demos), excerpt
+
+
+def without_indent(text: str) -> str:
+    return re.sub(r"^ +", "", text, flags=re.MULTILINE)
 
 
 def test_troubleshooting_names_every_error() -> None:
