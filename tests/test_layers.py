@@ -19,6 +19,7 @@ GROUND = (
     "events",
     "frames",
     "registration",
+    "tf2_names",
     "statistics",
     "rows",
     "_python_kernel",
