@@ -51,9 +51,10 @@ def robot(
     prefix: str = "",
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:
-    """Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at zero.
+    """Publish the frames of a robot until Ctrl-C, or print them as a tree.
 
-    Fixed joints are published once, the others again and again. If a frame is refused, because it conflicts with an
+    Joints without a position are at zero; with --follow, they are not published until ROS tells their positions. Fixed
+    joints are published once, the others again and again. If a frame is refused, because it conflicts with an
     edge of another program, it is tried again. A position beyond the limits of its joint is reported, but published.
 
     Example: tfbus robot arm.urdf shoulder=0.5 elbow=-1.2 --tree
