@@ -461,7 +461,7 @@ class Relay:
         if not own:
             return
         for frame in own:
-            latched = self._bus._topology.latched.get(frame)
+            latched = self._bus._topology.latched.samples.get(frame)
             kept = (latched, *(outbox.own_sample(frame) for outbox in self._outboxes))
             sample = next((sample for sample in kept if sample is not None), None)
             if sample is not None:
