@@ -396,7 +396,7 @@ class Bus:
         BusClosedError
         """
         self._check_usable()
-        return self._subscribers.subscribe(callback, tuple(self._topology.latched.values()), removed)
+        return self._subscribers.subscribe(callback, tuple(self._topology.latched.samples.values()), removed)
 
     def stream(self, capacity: int = 1_000, overflow: Overflow = "conflate") -> Stream:
         """The batches as an async iterator: ``with bus.stream() as batches: async for batch in batches``.
@@ -414,7 +414,7 @@ class Bus:
         """
         self._check_usable()
         stream = Stream(capacity, overflow, self._check_thread, self._detach_stream)
-        latched = tuple(self._topology.latched.values())
+        latched = tuple(self._topology.latched.samples.values())
         if latched:
             stream.put(latched)
         self._streams.append(stream)
@@ -518,25 +518,27 @@ class Bus:
             live, before = prefill, prefill.statistics(samples)
         else:
             moment = samples, self._removals + self._resets
-            latched = tuple(self._topology.latched.values())
-            before = BufferStatistics(samples - len(latched), 0, 0, 0, 0)
+            before = BufferStatistics(samples - len(self._topology.latched.samples), 0, 0, 0, 0)
             trees = self._trees.items() if prefill is None else ()
             known = next((live for live, since in trees if since == moment and live.forest.window == window), None)
             live = known or LiveTree(prefill or Forest(window), self._announce_past_loop)
             if known is None:
-                self._fill(live, latched)
+                self._fill(live, prefilled=prefill is not None)
                 self._trees[live] = moment if prefill is None else None
                 self._connect_feeds()
         share = Share(live, before)
         self._buffers[share] = None
         return share
 
-    def _fill(self, live: LiveTree, latched: Batch) -> None:
+    def _fill(self, live: LiveTree, *, prefilled: bool) -> None:
         """Give a new tree the latched samples."""
         late = LateBuffer(live, self._topology)
         live.tell_expired = self._topology.expired
-        if latched:
-            late.insert(latched)
+        latched = self._topology.latched
+        if not prefilled:
+            live.forest.share(latched)
+        elif latched.samples:
+            late.insert(tuple(latched.samples.values()))
         if not late.has_caught_up:
             self._late[live] = late
 
