@@ -725,7 +725,7 @@ paths_init(Paths *self, PyObject *args, PyObject *kwargs)
         PyErr_SetString(PyExc_TypeError, "answers must be samples");
         return -1;
     }
-    PyObject *is_held = PyObject_GetAttrString(lock, "locked");
+    PyObject *is_held = PyObject_GetAttr(lock, locked_string);
     PyObject *recent = is_held == NULL ? NULL : PyDict_New();
     if (recent == NULL) {
         Py_XDECREF(is_held);
@@ -964,7 +964,7 @@ room_for_rows(PyObject *stamps)
         const int plain = is_array(stamps);
         /* Python judges arrays with a mask. */
         if (plain < 0
-            || (!plain && (!PyObject_CheckBuffer(stamps) || PyObject_HasAttrString(stamps, "mask")))) {
+            || (!plain && (!PyObject_CheckBuffer(stamps) || PyObject_HasAttr(stamps, mask_string)))) {
             return NULL;
         }
         if (PyObject_GetBuffer(stamps, &view, PyBUF_STRIDES | PyBUF_FORMAT) < 0) {

@@ -53,7 +53,7 @@ REFERENCES(parked, 10)
 enum { CALLABLE, FUTURE, TASK };
 
 /* Of trio.lowlevel, once one is needed. */
-static PyObject *trio_checkpoint, *reschedule, *wait_task_rescheduled, *current_task, *abort_class;
+static PyObject *trio_checkpoint, *reschedule, *wait_task_rescheduled, *current_task, *abort_succeeded;
 
 static int
 needs_trio(void)
@@ -61,14 +61,19 @@ needs_trio(void)
     const struct {
         const char *name;
         PyObject **place;
-    } wanted[] = {{"checkpoint", &trio_checkpoint}, {"reschedule", &reschedule}, {"Abort", &abort_class},
-                  {"wait_task_rescheduled", &wait_task_rescheduled}, {"current_task", &current_task}};
+    } wanted[] = {{"checkpoint", &trio_checkpoint}, {"reschedule", &reschedule}, {"current_task", &current_task},
+                  {"wait_task_rescheduled", &wait_task_rescheduled}};
     for (size_t i = 0; i < sizeof wanted / sizeof *wanted; i++) {
         if (*wanted[i].place == NULL && (*wanted[i].place = imported("trio.lowlevel", wanted[i].name)) == NULL) {
             return 0;
         }
     }
-    return 1;
+    PyObject *abort = abort_succeeded != NULL ? NULL : imported("trio.lowlevel", "Abort");
+    if (abort != NULL) {
+        abort_succeeded = PyObject_GetAttrString(abort, "SUCCEEDED");
+        Py_DECREF(abort);
+    }
+    return abort_succeeded != NULL;
 }
 
 static PySendResult parked_step(PyObject *self, PyObject *value, PyObject **result);
@@ -151,7 +156,7 @@ static PyObject *
 parked_abort(Parked *self, PyObject *Py_UNUSED(raise_cancel))
 {
     Py_CLEAR(self->wake);
-    return PyObject_GetAttrString(abort_class, "SUCCEEDED");
+    return Py_NewRef(abort_succeeded);
 }
 
 static PyObject *
@@ -323,8 +328,8 @@ feed_init(Feed *self, PyObject *args, PyObject *kwargs)
         PyErr_SetString(PyExc_RuntimeError, "a Feed is initialised once, because it may be at work");
         return -1;
     }
-    parts[ORDERS] = PyObject_GetAttrString(parts[INDEX], "orders");
-    parts[FORGET] = parts[ORDERS] == NULL ? NULL : PyObject_GetAttrString(parts[INDEX], "forget");
+    parts[ORDERS] = PyObject_GetAttr(parts[INDEX], orders_string);
+    parts[FORGET] = parts[ORDERS] == NULL ? NULL : PyObject_GetAttr(parts[INDEX], forget_string);
     if (parts[FORGET] == NULL || !PyIter_Check(parts[ORDERS])) {
         Py_XDECREF(parts[ORDERS]);
         Py_XDECREF(parts[FORGET]);
@@ -596,7 +601,7 @@ bare_sleep(Parked *waiter, PyObject *loop)
         sleep = wakes == NULL ? NULL : PyObject_GetIter(wakes);
     } else {
         wakes = needs_trio() ? PyObject_CallNoArgs(current_task) : NULL;
-        PyObject *abort = wakes == NULL ? NULL : PyObject_GetAttrString(OBJECT(waiter), "abort");
+        PyObject *abort = wakes == NULL ? NULL : PyObject_GetAttr(OBJECT(waiter), abort_string);
         sleep = abort == NULL ? NULL : PyObject_CallFunctionObjArgs(wait_task_rescheduled, abort, NULL);
         Py_XDECREF(abort);
     }
