@@ -363,7 +363,7 @@ async def attacked(stranger: Stranger, **options: Any) -> AsyncIterator[tuple[Do
                 await stranger.leave()
                 await until(lambda: len(link.peers) == 1)
                 other.publish(static("map", "chair"))
-                bus.publish(static("map", "table"))
+                bus.publish([static("map", "table"), static("map", "lamp")])
                 await until(lambda: statics(bus).get("chair") == statics(other).get("table") == "map")
                 other.publish(static("room", "chair"))
                 bus.remove_frame("table")

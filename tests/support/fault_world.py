@@ -410,7 +410,7 @@ class Router:
 
     def start(self) -> None:
         prefix = () if self.host is None else self.host.prefix
-        self.program = Program(*prefix, sys.executable, "-c", _ROUTER, self.address, *self.others)
+        self.program = Program(*prefix, sys.executable, "-P", "-c", _ROUTER, self.address, *self.others)
         self.program.output.expect("ready")
 
     def signal(self, number: signal.Signals) -> None:

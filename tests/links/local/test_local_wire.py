@@ -349,7 +349,7 @@ async def test_a_process_of_another_user_cannot_talk_even_if_it_may_enter(direct
         (path,) = files_in(directory)
         for each in (path, path.parent):
             each.chmod(0o777)
-        with Program(sys.executable, "-c", OF_ANOTHER_USER, path) as program:
+        with Program(sys.executable, "-P", "-c", OF_ANOTHER_USER, path) as program:
             await anyio.to_thread.run_sync(program.output.expect, "^0$")
         await until(lambda: bool(ear.warnings))
         assert ear.items == []
@@ -384,7 +384,7 @@ anyio.run(main, backend=sys.argv[3])
 
 
 def start_peer(directory: str, what: str = "run", backend: str = "asyncio", loopback: bool = False) -> Program:
-    return Program(sys.executable, "-c", PEER, directory, what, backend, "loopback" * loopback)
+    return Program(sys.executable, "-P", "-c", PEER, directory, what, backend, "loopback" * loopback)
 
 
 async def expect(program: Program, pattern: str) -> str:
