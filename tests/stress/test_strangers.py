@@ -265,7 +265,7 @@ class LocalStranger:
     async def meet(self) -> bytes:
         """Meet the attacked link; returns what that says first."""
         # The first name is that of the oldest link, which the test attacks.
-        self._peer = await RawPeer.connect(files_in(self._directory)[0], self._domain)
+        self._peer = await RawPeer.connect(files_in(self._directory)[0])
         await self._peer.meet()
         return await self._peer.hear()
 

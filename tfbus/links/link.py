@@ -24,7 +24,7 @@ from tfbus.links.endpoint import Endpoint, HearsTime
 from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import RemoteQuestion
 from tfbus.links.seams import Left, Received, Wire
-from tfbus.registration import Registration, warn_unless_entered
+from tfbus.registration import AsyncOnly, Registration, warn_unless_entered
 from tfbus.stamps import LATEST, Latest, as_duration, as_stamp, from_seconds, to_seconds
 from tfbus.statistics import LinkStatistics, QueueStatistics
 from tfbus.tf_message import MalformedMessageError
@@ -183,7 +183,7 @@ class ClockFollower:
                 await self._heard.wait()
 
 
-class Link:
+class Link(AsyncOnly):
     """Joins a bus to other buses, or to another world: ``async with link``.
 
     The samples that are published in one turn of the event loop are sent together at its end. Received messages wait in
