@@ -453,6 +453,18 @@ feed_ask(Feed *self, PyObject *const *args, Py_ssize_t nargs)
     return OBJECT(made);
 }
 
+/* park(waiter): park a lookup that has no task if newer samples are all that it lacks, and say whether it is. */
+static PyObject *
+feed_park_one(Feed *self, PyObject *waiter)
+{
+    if (!PyObject_TypeCheck(waiter, ParkedType)) {
+        PyErr_SetString(PyExc_TypeError, "only a parked lookup has a place");
+        return NULL;
+    }
+    const int parked = feed_park(self, (Parked *)waiter);
+    return parked < 0 ? NULL : PyBool_FromLong(parked);
+}
+
 /* Ask; if newer samples are all that is missing, begin to sleep: 1. 0 if it has its answer, or Python has to go on; -1 for
  * an error. */
 static int
@@ -739,6 +751,8 @@ feed_insert(Feed *self, PyObject *batch)
 static PyMethodDef feed_methods[] = {
     {"ask", FAST(feed_ask), METH_FASTCALL,
      PyDoc_STR("ask(target, source, at, turn): a lookup to be awaited, once; then it has its answer, or Python has to go on.")},
+    {"park", (PyCFunction)feed_park_one, METH_O,
+     PyDoc_STR("park(waiter): park a lookup that calls back if newer samples are all that it lacks; whether it is parked.")},
     {"insert", (PyCFunction)feed_insert, METH_O,
      PyDoc_STR("insert(batch): store a batch and wake the lookups that it has unblocked, if all is plain; else do "
                "nothing.")},

@@ -29,7 +29,7 @@ wake a waiter is to call the function that it brought along: nothing here knows 
 import logging
 import math
 from bisect import bisect_left, insort
-from collections.abc import Callable, Container, Hashable, Iterable, KeysView
+from collections.abc import Callable, Container, Hashable, Iterable, KeysView, Sequence
 from dataclasses import astuple, dataclass
 from itertools import count, takewhile
 from operator import sub
@@ -160,7 +160,7 @@ class Waiter(Parked):
 
     Attributes
     ----------
-    others : tuple of Question
+    others : sequence of Question
         Further questions that need an answer: the waiter is woken when one of them can no longer have an answer.
     share : Share or None
         The share of the buffer that asks.
@@ -174,7 +174,7 @@ class Waiter(Parked):
         Whether the index has noted the names of its questions.
     """
 
-    others: tuple[Question, ...] = ()
+    others: Sequence[Question] = ()
     share: "Share | None" = None
     patience = math.inf
     blocked_by: TransformLookupError | None = None
