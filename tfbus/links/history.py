@@ -13,7 +13,7 @@ from math import inf
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.message import Heard
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch, Relay
+from tfbus.links.relay import OutgoingBatch, ReceivedBatch
 from tfbus.links.replica import Replica
 from tfbus.stamps import from_seconds
 from tfbus.tree.history import FrameHistory
@@ -34,17 +34,13 @@ MOST_REMEMBERED = 10_000
 """The most peers that are remembered as asked."""
 
 
-def chunk_of_past(
-    bus: Bus, relay: Relay, replica: Replica, seconds: float, after: str
-) -> tuple[list[OutgoingBatch], bool]:
+def chunk_of_past(bus: Bus, replica: Replica, seconds: float, after: str) -> tuple[list[OutgoingBatch], bool]:
     """The moving samples of the last seconds that a link tells to a peer, and whether these are all.
 
     Parameters
     ----------
     bus : Bus
         Its buffers hold the samples.
-    relay : Relay
-        The relay of the bus.
     replica : Replica
         The copy of the frames that the link brings.
     seconds : float
@@ -55,13 +51,12 @@ def chunk_of_past(
     told: list[OutgoingBatch] = []
     count = 0
     for place in range(bisect_right(frames, after), len(frames)):
-        number = relay.newest_number(frames[place])
-        samples = [] if number is None else _recent(bus, frames[place], seconds)
-        if number is None or not samples:
+        newest, samples = replica.entries[frames[place]], _recent(bus, frames[place], seconds)
+        if not samples:
             continue
         if told and count + len(samples) > CHUNK:
             return told, False
-        told.append(OutgoingBatch(number[1], number[0], samples))
+        told.append(OutgoingBatch(newest.origin, newest.number, samples))
         count += len(samples)
     return told, True
 

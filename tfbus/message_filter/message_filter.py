@@ -13,7 +13,7 @@ One task reads the source. A message whose transform is known on arrival is read
 buffer's index as a lookup is, but no task sleeps for it: the insertion that unblocks it calls a function.
 
 * If the insertion hands over the answer, the message is ready before `publish` returns. With one target and no
-  tolerance this is the usual end of a wait.
+  margin this is the usual end of a wait.
 * Otherwise the message is due, and a task, the attendant, asks again: it makes the message ready, parks it once more,
   or drops it. So it is with several targets, after a change of the target, when the time of the message is up, when its
   transform can no longer come, and when the buffer is closed. One attendant serves all messages that are due.
@@ -27,6 +27,7 @@ A clock that is not a class of tfbus has no alarms: there each waiting message t
 
 import logging
 import math
+import warnings
 from bisect import bisect_left, insort
 from collections import Counter
 from collections.abc import AsyncGenerator, AsyncIterable, Callable, Sequence
@@ -58,7 +59,7 @@ from tfbus.errors import (
 )
 from tfbus.frames import is_frame
 from tfbus.geometry.stamped import TransformStamped, answer_of
-from tfbus.registration import Registration
+from tfbus.registration import AsyncOnly, Registration
 from tfbus.rows import IDENTITY
 from tfbus.stamps import LATEST, STAMP_MAX, Latest, as_duration, as_stamp, from_seconds
 from tfbus.tree.lookup import Question
@@ -287,7 +288,7 @@ class Targets(Generic[AnswerT]):
     def __init__(self, buffer: Buffer, target: str | Sequence[str], tolerance: float) -> None:
         self._buffer = buffer
         self.one = isinstance(target, str)
-        self._tolerance = from_seconds(as_duration(tolerance, "tolerance"))
+        self._tolerance = from_seconds(as_duration(tolerance, "margin"))
         self.replace(target)
 
     def replace(self, target: str | Sequence[str]) -> None:
@@ -348,7 +349,7 @@ MessageOverflow = Literal["drop_oldest", "drop_newest", "block"]
 """Drop the oldest message, drop the new message, or stop reading the source."""
 
 
-class MessageFilter(Generic[MessageT, AnswerT]):
+class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
     """Pairs each message with its transform: ``async with MessageFilter(...) as pairs: async for message, t in pairs``.
 
     Every message that arrives is delivered once or dropped once, and no drop is silent: `dropped` counts them by
@@ -367,9 +368,9 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         know the target.
     frame, stamp : callable, optional
         Give the frame and the stamp (ns, or `LATEST`) of a message; by default its attributes `frame` and `stamp`.
-    tolerance : float
-        In s. A message is ready only when the transforms at its stamp and this much later are both known. So it demands
-        more, whereas the `tolerance` of a lookup allows more.
+    margin : float
+        In s. A message is ready only when the transforms at its stamp and this much later are both known, as with the
+        ``setTolerance`` of tf2.
     timeout : float, optional
         How long a message may wait, in s on the bus's clock from its arrival; None for ever. A ready message does not
         time out.
@@ -384,6 +385,8 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     on_drop : callable, optional
         Called with a message, the reason, and the error that says what it lacked, or None for a ready message. If it
         raises an `Exception`, that is logged once and counted.
+    tolerance : float, optional
+        The earlier name of `margin`; deprecated, because the `tolerance` of a lookup means the opposite.
 
     Raises
     ------
@@ -413,12 +416,13 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         *,
         frame: Callable[[MessageT], str] | None = None,
         stamp: Callable[[MessageT], int | Latest] | None = None,
-        tolerance: float = 0.0,
+        margin: float = 0.0,
         timeout: float | None = None,
         capacity: int = 100,
         overflow: MessageOverflow = "drop_oldest",
         order: Order = "ready",
         on_drop: Callable[[MessageT, DropReason, TransformError | None], object] | None = None,
+        tolerance: float | None = None,
     ) -> None: ...
 
     @overload
@@ -430,12 +434,13 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         *,
         frame: Callable[[MessageT], str] | None = None,
         stamp: Callable[[MessageT], int | Latest] | None = None,
-        tolerance: float = 0.0,
+        margin: float = 0.0,
         timeout: float | None = None,
         capacity: int = 100,
         overflow: MessageOverflow = "drop_oldest",
         order: Order = "ready",
         on_drop: Callable[[MessageT, DropReason, TransformError | None], object] | None = None,
+        tolerance: float | None = None,
     ) -> None: ...
 
     def __init__(
@@ -446,13 +451,21 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         *,
         frame: Callable[[MessageT], str] | None = None,
         stamp: Callable[[MessageT], int | Latest] | None = None,
-        tolerance: float = 0.0,
+        margin: float = 0.0,
         timeout: float | None = None,
         capacity: int = 100,
         overflow: MessageOverflow = "drop_oldest",
         order: Order = "ready",
         on_drop: Callable[[MessageT, DropReason, TransformError | None], object] | None = None,
+        tolerance: float | None = None,
     ) -> None:
+        if tolerance is not None:
+            warnings.warn(
+                "the tolerance of a MessageFilter is called margin, because that of a lookup means the opposite",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            margin = tolerance
         if not isinstance(messages, AsyncIterable):
             raise TypeError(f"messages must be an async iterable, not {messages!r}")
         if overflow not in ("drop_oldest", "drop_newest", "block"):
@@ -462,7 +475,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
                 raise TypeError(f"{name} must be callable, not {function!r}")
         self.buffer = buffer
         self._messages = messages
-        self._targets: Targets[AnswerT] = Targets(buffer, target, tolerance)
+        self._targets: Targets[AnswerT] = Targets(buffer, target, margin)
         self._frame: Callable[[MessageT], str] = frame or attrgetter("frame")
         self._stamp: Callable[[MessageT], int | Latest] = stamp or attrgetter("stamp")
         self._timeout = math.inf if timeout is None else as_duration(timeout, "timeout")

@@ -10,7 +10,7 @@ from support.wires import LIVE, Ear, met
 from support.zenoh_wires import Way, listening, start_router, talk, way_to
 
 from tfbus.links.seams import Joined, Left
-from tfbus.links.zenoh import zenoh_router
+from tfbus.links.zenoh import wire
 from tfbus.links.zenoh.neighbours import Neighbours
 from tfbus.links.zenoh.sessions import router_config
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
@@ -118,9 +118,9 @@ async def test_a_router_whose_session_breaks_at_once_says_so_at_first_and_later_
     breaks: str, address: str, domain: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kinds: list[Any] = [Broken] if breaks == "at first" else [Silent, Broken]
-    monkeypatch.setattr(zenoh_router, "Neighbours", lambda session: (kinds.pop(0) if kinds else Neighbours)(session))
+    monkeypatch.setattr(wire, "Neighbours", lambda session: (kinds.pop(0) if kinds else Neighbours)(session))
     if breaks == "at first":
-        with pytest.raises(OSError, match="the session of a router broke at once: closed"):
+        with pytest.raises(OSError, match="the session with a router broke at once: closed"):
             async with ZenohRouter(address):
                 raise AssertionError("it has opened")
     async with (
