@@ -5,8 +5,6 @@ either program and start it again: the other one goes on by itself. Ctrl-C ends 
 other. `tfbus broadcast` does the same with options.
 """
 
-from contextlib import suppress
-
 import anyio
 
 import tfbus
@@ -23,5 +21,7 @@ async def main() -> None:
 
 
 if __name__ == "__main__":
-    with suppress(KeyboardInterrupt):
+    try:
         anyio.run(main)
+    except* KeyboardInterrupt:
+        pass

@@ -4,8 +4,6 @@ Run it with `python demos/tf_listener.py`, and `python demos/tf_broadcaster.py` 
 Without a broadcaster it says what is missing. Ctrl-C ends it. `tfbus listen` does the same with options.
 """
 
-from contextlib import suppress
-
 import anyio
 
 import tfbus
@@ -26,5 +24,7 @@ async def main() -> None:
 
 
 if __name__ == "__main__":
-    with suppress(KeyboardInterrupt):
+    try:
         anyio.run(main)
+    except* KeyboardInterrupt:
+        pass

@@ -245,7 +245,7 @@ def test_the_names_of_tf2_make_no_access_to_an_attribute_slower(kind: type) -> N
 
 
 async def no_messages() -> AsyncIterator[PointStamped]:
-    for message in ():
+    for message in list[PointStamped]():
         yield message
 
 

@@ -167,7 +167,7 @@ def test_drop_leaves_out_only_the_rejected_samples_and_logs_them_once(caplog: py
     assert sum("loop" in message for message in caplog.messages) == 1
 
 
-@pytest.mark.parametrize("nonsense", [None, 5, "map", b"map", [moving("map", "a", 1), None], ["map"], {"map": 1}])
+@pytest.mark.parametrize("nonsense", [None, 5, "", b"", "map", [moving("map", "a", 1), None], ["map"], {"map": 1}])
 def test_a_batch_with_an_object_that_is_no_sample_is_refused_whole(bus: Bus, buffer: Buffer, nonsense: object) -> None:
     with pytest.raises(TypeError, match="TransformStamped"):
         bus.publish(nonsense)  # type: ignore[arg-type]

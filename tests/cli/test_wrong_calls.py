@@ -28,7 +28,18 @@ NEEDS = {"plot": "matplotlib", "view": "viser", "foxglove": "foxglove", "robot":
         ("listen --backend curio", "--backend"),
         ("listen --log-level loud", "--log-level"),
         ("broadcast --listen rubbish", "an address is like tcp/192.168.1.5:7447, not 'rubbish'"),
-        ("router --listen 7447", "an address is like tcp/"),
+        *(
+            (f"router --listen {address}", "an address is like tcp/")
+            for address in (
+                "7447",
+                "foo/127.0.0.1:7447",
+                "tcp/:7447",
+                "tcp/::1:7447",
+                "tcp/a:x",
+                "tcp/a:65536",
+                "tcp//a:1",
+            )
+        ),
         ("static map odom --domain 'a b'", "a domain is made of letters"),
         # The commands of tf2
         ("view_frames", "tf2's view_frames is `tfbus tree`"),

@@ -134,7 +134,7 @@ class DomainEnd(Endpoint):
         self._replicas: dict[str, Replica] = {}
         self.own = self._replica_of(self._robot)
         self._agreement = Agreement()
-        self._history = HistoryAsker(history or 0.0, self._ask_past, now)
+        self._history = HistoryAsker(history or 0.0, wire.send, now)
         self.lookups = RemoteLookups(wire.send, name)
         # The last sign of each peer that agrees with this link: the same sign once more need not wake the event loop.
         self._resting: dict[str, bytes] = {}
@@ -193,14 +193,13 @@ class DomainEnd(Endpoint):
 
     def split(self, item: Received) -> Iterator[Any]:
         if not isinstance(item.content, bytes):
-            return iter((item.content,))
-        return read_message(item.content) if item.moving or item.urgent else self._split_sign(item)
-
-    def _split_sign(self, item: Received) -> Iterator[Any]:
+            yield item.content
+            return
         for part in read_message(item.content):
             yield part
             # Only a sign without a time may rest, because a clock may be followed later.
-            if isinstance(part, Heard) and part.time is None and self._agreement.rests(item.sender, self._now()):
+            is_plain = isinstance(part, Heard) and part.kind is Kind.SIGN and part.time is None
+            if is_plain and self._agreement.rests(item.sender, self._now()):
                 self._resting[item.sender] = item.content
 
     def _warn_of_wire(self, error: Exception) -> None:
@@ -607,9 +606,6 @@ class DomainEnd(Endpoint):
         entries, final = chunk_of_past(self.bus, self.own, seconds, after)
         out = Outgoing(Kind.PAST, self.relay.origin, 0, Claim(0, 0, 0, final))
         self._wire.send(sender, write_message(out, entries))
-
-    def _ask_past(self, peer: str, seconds: float, after: str) -> None:
-        self._wire.send(peer, write_text(Kind.PAST_QUESTION, {"seconds": seconds, "after": after}))
 
     def _end_history(self, peer: str, lost: Peer | None = None) -> None:
         """Stop waiting for the past of a peer, and publish its live messages that were held back."""

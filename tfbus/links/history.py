@@ -12,7 +12,7 @@ from math import inf
 
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.message import Heard
+from tfbus.links.message import Heard, Kind, write_text
 from tfbus.links.relay import OutgoingBatch, ReceivedBatch
 from tfbus.links.replica import Replica
 from tfbus.stamps import from_seconds
@@ -92,7 +92,7 @@ def _oldest(history: FrameHistory) -> int:
 
 @dataclass(slots=True)
 class _Open:
-    due: float
+    due: float = 0.0
     after: str = ""
     held: list[Heard] = field(default_factory=list)
     size: int = 0
@@ -105,8 +105,8 @@ class HistoryAsker:
     ----------
     seconds : float
         0 to ask nobody.
-    ask : callable
-        Asks a peer for so many seconds of the frames after a name.
+    send : callable
+        Sends a message to a peer.
     now : callable
         Returns a monotonic time in s.
 
@@ -116,9 +116,9 @@ class HistoryAsker:
         The open questions, by the ids of the asked peers.
     """
 
-    def __init__(self, seconds: float, ask: Callable[[str, float, str], object], now: Callable[[], float]) -> None:
+    def __init__(self, seconds: float, send: Callable[[str, bytes], object], now: Callable[[], float]) -> None:
         self._seconds = seconds
-        self._ask = ask
+        self._send = send
         self._now = now
         self._asked: dict[str, None] = {}
         self.open: dict[str, _Open] = {}
@@ -130,8 +130,7 @@ class HistoryAsker:
             self._asked[peer] = None
             if len(self._asked) > MOST_REMEMBERED:
                 del self._asked[next(iter(self._asked))]
-            self.open[peer] = _Open(self._now() + PATIENCE)
-            self._ask(peer, self._seconds, "")
+            self._ask(peer, "")
 
     def holds(self, peer: str, message: Heard) -> bool:
         """Hold a live message back; returns whether that is so."""
@@ -154,10 +153,13 @@ class HistoryAsker:
         last = max(_children(message), default="")
         if last <= waiting.after or len(waiting.held) >= MOST_HELD:
             return False
-        waiting.after = last
-        waiting.due = self._now() + PATIENCE
-        self._ask(peer, self._seconds, last)
+        self._ask(peer, last)
         return True
+
+    def _ask(self, peer: str, after: str) -> None:
+        waiting = self.open.setdefault(peer, _Open())
+        waiting.after, waiting.due = after, self._now() + PATIENCE
+        self._send(peer, write_text(Kind.PAST_QUESTION, {"seconds": self._seconds, "after": after}))
 
     def end(self, peer: str) -> list[Heard]:
         """Stop waiting for the answer of a peer; returns its messages that were held back."""

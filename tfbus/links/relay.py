@@ -155,10 +155,10 @@ class Outbox:
         withdrawn : bool
             Whether a frame left this bus only because its owner was lost.
         """
-        entry = self.outgoing(published)
+        goes_out = not echo and not (withdrawn and self.keeps_withdrawn)
+        entry = self.outgoing(published) if goes_out else published.within(self.frames)
         if entry is None:
             return
-        goes_out = not echo and not (withdrawn and self.keeps_withdrawn)
         if goes_out:
             self._entries.append(entry)
             self.pending += entry.size
@@ -607,20 +607,8 @@ class Relay:
         else:
             provenance = Provenance(self.origin, self._next_number()) if self._outboxes else None
         latest = self._latest.pop(frame, None)
-        self._forget_frame(frame, provenance)
-        if provenance is not None:
-            removal = RemovedFrame(provenance.origin, provenance.sequence, frame)
-            for outbox in self._outboxes:
-                if latest is not None or outbox.keeps_withdrawn:
-                    outbox.add(removal, echo=outbox is provenance.outbox)
-        elif latest is not None:
-            withdrawal = RemovedFrame(latest.origin, latest.sequence, frame)
-            for outbox in self._outboxes:
-                outbox.add(withdrawal, echo=outbox is latest.outbox, withdrawn=True)
-
-    def _forget_frame(self, frame: str, provenance: Provenance | None) -> None:
-        """Forget what holds for a frame that has gone, by a removal or, without one, because its owner was lost."""
         self._settled.pop(frame, None)
+        self._newest.pop(frame, None)
         if self._passed is not None:
             # A withdrawn sample may come again unchanged.
             (self._passed.forget if provenance is None else self._passed.retire)(frame)
@@ -629,7 +617,14 @@ class Relay:
             self._removed[frame] = provenance.rank
             if len(self._removed) > _REMEMBERED:
                 del self._removed[next(iter(self._removed))]
-        self._newest.pop(frame, None)
+            removal = RemovedFrame(provenance.origin, provenance.sequence, frame)
+            for outbox in self._outboxes:
+                if latest is not None or outbox.keeps_withdrawn:
+                    outbox.add(removal, echo=outbox is provenance.outbox)
+        elif latest is not None:
+            withdrawal = RemovedFrame(latest.origin, latest.sequence, frame)
+            for outbox in self._outboxes:
+                outbox.add(withdrawal, echo=outbox is latest.outbox, withdrawn=True)
 
     def _is_outranked(self, sample: ReceivedTransform, rank: Rank) -> bool:
         """Whether a higher rank holds: of a removal or a static sample; for a static or own sample, of any."""
