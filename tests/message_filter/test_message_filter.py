@@ -691,3 +691,26 @@ async def test_a_callback_may_call_the_filter_and_the_bus(bus: Bus, buffer: Buff
         assert (seen, pairs.callbacks_failed) == ([1, 2], 0)
         assert [(await anext(pairs))[1].parent] == ["odom"]
         assert pairs.dropped == {"queue full": 1, "too old": 1}
+
+
+async def test_a_callback_may_change_the_target_while_the_filter_is_left(buffer: Buffer, streams: Streams) -> None:
+    def drop(_message: Scan, _reason: DropReason, _error: TransformError | None) -> None:
+        pairs.set_target("odom")
+
+    async with MessageFilter(streams.receive, buffer, "map", on_drop=drop) as pairs:
+        put(streams, Scan(1), Scan(2), Scan(3))
+        await settle()
+    assert (pairs.dropped, pairs.callbacks_failed, buffer.pending()) == ({"closed": 3}, 0, ())
+
+
+async def test_a_changed_target_does_not_prolong_a_wait(
+    clock: SimulatedClock, buffer: Buffer, streams: Streams
+) -> None:
+    async with MessageFilter(streams.receive, buffer, "map", timeout=2.0) as pairs:
+        put(streams, Scan(1))
+        await clock.advance(1.5)
+        pairs.set_target("odom")
+        await clock.advance(0.4)
+        assert pairs.dropped == {}
+        await clock.advance(0.1)
+        assert pairs.dropped == {"unknown frame": 1}

@@ -266,23 +266,22 @@ typedef struct {
     PyObject *feeds;
     PyObject *judge;      /* Judge */
     PyObject *kind;       /* the class of samples */
-    PyObject *tell;       /* called with each batch while a container of `listeners` has elements */
-    PyObject *listeners;  /* a tuple of containers */
+    PyObject *listeners;  /* a tuple of containers, each followed by a callable for each batch while it has elements */
     PyObject *busy;       /* a tuple of containers; nothing is taken while one of them has elements */
     long long samples;    /* how many were taken */
     unsigned long thread; /* the only one that may publish */
     char open;
 } Intake;
 
-REFERENCES(intake, 6)
+REFERENCES(intake, 5)
 
 static int
 intake_init(Intake *self, PyObject *args, PyObject *kwargs)
 {
-    PyObject *judge, *kind, *tell, *listeners, *busy;
+    PyObject *judge, *kind, *listeners, *busy;
     if (!has_no_keywords(kwargs)
-        || !PyArg_ParseTuple(args, "O!O!OO!O!:Intake", JudgeType, &judge, &PyType_Type, &kind, &tell, &PyTuple_Type,
-                             &listeners, &PyTuple_Type, &busy)) {
+        || !PyArg_ParseTuple(args, "O!O!O!O!:Intake", JudgeType, &judge, &PyType_Type, &kind, &PyTuple_Type, &listeners,
+                             &PyTuple_Type, &busy)) {
         return -1;
     }
     if (self->feeds != NULL) {
@@ -295,12 +294,10 @@ intake_init(Intake *self, PyObject *args, PyObject *kwargs)
     }
     Py_INCREF(judge);
     Py_INCREF(kind);
-    Py_INCREF(tell);
     Py_INCREF(listeners);
     Py_INCREF(busy);
     self->judge = judge;
     self->kind = kind;
-    self->tell = tell;
     self->listeners = listeners;
     self->busy = busy;
     self->feeds = feeds;
@@ -349,6 +346,30 @@ has_any(PyObject *containers)
         size = PyObject_Size(PyTuple_GetItem(containers, i));
     }
     return size < 0 ? -1 : size > 0;
+}
+
+/* Give a batch to those who listen. */
+static int
+intake_tell(const Intake *self, PyObject *batch)
+{
+    PyObject *listeners = self->listeners, *objects = NULL;
+    const Py_ssize_t count = PyTuple_Size(listeners);
+    int failed = 0;
+    for (Py_ssize_t i = 0; i + 1 < count && !failed; i += 2) {
+        const Py_ssize_t size = PyObject_Size(PyTuple_GetItem(listeners, i));
+        if (size == 0) {
+            continue;
+        }
+        if (size > 0 && objects == NULL) {
+            objects = PyTuple_CheckExact(batch) ? Py_NewRef(batch) : columns_samples(batch, self->kind);
+        }
+        PyObject *tell = PyTuple_GetItem(listeners, i + 1);
+        PyObject *told = size < 0 || objects == NULL ? NULL : PyObject_CallFunctionObjArgs(tell, objects, NULL);
+        failed = told == NULL;
+        Py_XDECREF(told);
+    }
+    Py_XDECREF(objects);
+    return failed ? -1 : 0;
 }
 
 /* take(samples, invalid): judge a batch, insert it into all trees and tell those who listen, if it is plain. Returns
@@ -401,16 +422,7 @@ intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
         Py_XDECREF(done);
     }
     Py_DECREF(feeds);
-    const int heard = has_any(self->listeners);
-    if (heard > 0) {
-        PyObject *objects = PyTuple_CheckExact(batch) ? Py_NewRef(batch) : columns_samples(batch, self->kind);
-        PyObject *told = objects == NULL ? NULL : PyObject_CallFunctionObjArgs(self->tell, objects, NULL);
-        Py_XDECREF(objects);
-        if (told == NULL) {
-            set_aside(&trouble);
-        }
-        Py_XDECREF(told);
-    } else if (heard < 0) {
+    if (intake_tell(self, batch) < 0) {
         set_aside(&trouble);
     }
     Py_DECREF(batch);

@@ -576,6 +576,25 @@ feed_ask(Feed *self, PyObject *const *args, Py_ssize_t nargs)
     return OBJECT(made);
 }
 
+/* park(waiter): park a lookup that calls back if newer samples are all that it lacks, and say whether it is parked. */
+static PyObject *
+feed_park(Feed *self, PyObject *waiter)
+{
+    int64_t at, limit;
+    if (!PyObject_TypeCheck(waiter, ParkedType)) {
+        PyErr_SetString(PyExc_TypeError, "only a parked lookup has a place");
+        return NULL;
+    }
+    const History *edge = feed_edge(self, (Parked *)waiter, &at, &limit);
+    PyObject *child = edge == NULL ? NULL : PyObject_GetAttr(OBJECT(edge), child_string);
+    if (child == NULL) {
+        return PyErr_Occurred() ? NULL : PyBool_FromLong(0);
+    }
+    const int failed = feed_line_up(self, (Parked *)waiter, child, at, limit) < 0;
+    Py_DECREF(child);
+    return failed ? NULL : PyBool_FromLong(1);
+}
+
 /* The hook of this thread for new asynchronous generators, or NULL. Each event loop sets one of its own while it runs; to ask
  * which loop runs takes asyncio a call of the operating system. */
 static PyObject *
@@ -963,6 +982,8 @@ static PyMethodDef feed_methods[] = {
     {"ask", FAST(feed_ask), METH_FASTCALL,
      PyDoc_STR("ask(target, source, at, timeout): a lookup to be awaited, once; then it has its answer, or Python has to "
                "go on. None if the timeout is neither None nor a float that is a duration.")},
+    {"park", (PyCFunction)feed_park, METH_O,
+     PyDoc_STR("park(waiter): park a lookup that calls back if newer samples are all that it lacks; whether it is parked.")},
     {"insert", (PyCFunction)feed_insert, METH_O,
      PyDoc_STR("insert(batch): store a batch and wake the lookups that it has unblocked, if all is plain; else do "
                "nothing.")},

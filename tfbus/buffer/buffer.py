@@ -1,7 +1,7 @@
 """The buffer: a tree that a bus fills, and lookups that wait for missing transforms."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, SupportsIndex, TypeVar
@@ -280,15 +280,6 @@ class Buffer:
         if wait.cancel_end is not None:
             wait.cancel_end()
         return found
-
-    async def _lookup_among(self, questions: Sequence[Question]) -> None:
-        """Wait until each question has had an answer; if waiting cannot help one of them, raise its error at once.
-
-        Called by message filters.
-        """
-        asked = tuple(map(self._on_bus, questions))
-        for place, question in enumerate(asked):
-            await self._lookups.lookup(question, None, asked[place + 1 :])
 
     async def transform(
         self,

@@ -445,18 +445,13 @@ class Lookups:
             raise
         return found if self._local_names is None else self._local_names.answer(found)
 
-    async def lookup(
-        self, question: Question, timeout: float | None, others: tuple[Question, ...] = ()
-    ) -> TransformStamped:
-        """The answer as soon as there is one, after a checkpoint; the errors are as in `Buffer.lookup`.
-
-        `others` are further questions that need an answer: if waiting cannot help one of them, its error is raised.
-        """
+    async def lookup(self, question: Question, timeout: float | None) -> TransformStamped:
+        """The answer as soon as there is one, after a checkpoint; the errors are as in `Buffer.lookup`."""
         patience = math.inf if timeout is None else as_duration(timeout, "timeout")
         last_reset = self.share.live.last_reset
         await checkpoint()
         wait = Wait(question, self.now(), _nothing)
-        wait.others, wait.patience = others, patience
+        wait.patience = patience
         return await self.go_on(wait, last_reset)
 
     async def go_on(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:
@@ -466,7 +461,7 @@ class Lookups:
         """
         if self._alarms is None:
             return await self._wait_in_scopes(wait, last_reset)
-        waiting, paths = self.share.live.waiting, self.forest.paths
+        waiting = self.share.live.waiting
         try:
             while True:
                 waiting.remove(wait)
@@ -477,10 +472,9 @@ class Lookups:
                     return found
                 # Timeouts of zero give the others a turn as well.
                 await (checkpoint() if wait.expired else asleep(wait.sleep))
-                found = wait.answer
-                if found is not None and wait.version == paths.version:
-                    # Nothing has changed since the insertion woke and removed the waiter.
-                    return found if self._local_names is None else self._local_names.answer(found)
+                found = self.given(wait)
+                if found is not None:
+                    return found
         finally:
             self.end(wait)
 
@@ -501,6 +495,59 @@ class Lookups:
         self._set_end(wait, loop)
         self.feed.loop, self.feed.call_after = loop, self._alarms.on(loop)
         return sleep
+
+    def given(self, wait: Wait) -> TransformStamped | None:
+        """The answer that came with the wake-up, if nothing has changed since."""
+        found: TransformStamped | None = wait.answer
+        if found is None or wait.version != self.forest.paths.version:
+            return None
+        return found if self._local_names is None else self._local_names.answer(found)
+
+    def park(self, wait: Wait, error: TransformLookupError | None = None) -> bool:
+        """Let a lookup wait: its `wake` is called inside the insertion that may unblock it, and by its alarm.
+
+        Parameters
+        ----------
+        wait : Wait
+            A lookup that has no answer now.
+        error : TransformLookupError, optional
+            The error that blocks the lookup. Without it, only the kernel may park the lookup: one question that lacks
+            nothing but newer samples.
+
+        Returns
+        -------
+        bool
+            Whether the lookup waits.
+
+        Raises
+        ------
+        BusClosedError
+            If there is an error, and no more samples will come.
+        """
+        ended = self.share.end_reason
+        if error is None and (self.feed is None or ended is not None or wait.others):
+            return False
+        if ended is not None:
+            raise BusClosedError(ended) from error
+        wait.share = self.share
+        try:
+            if error is not None:
+                self.share.live.waiting.remove(wait)
+                self.share.park(wait, error)
+            elif not self.feed.park(wait):
+                return False
+            if self._alarms is not None:
+                loop = running_loop()
+                if self._looking_on is not loop:
+                    self._look_after(max(REPORT_AFTER - to_seconds(self.now() - wait.since), 0.0))
+                if wait.patience == 0.0:
+                    wait.expired = True
+                else:
+                    self._set_end(wait, loop)
+        except BaseException:
+            self.end(wait)
+            raise
+        return True
 
     def end(self, wait: Wait) -> None:
         """Leave nothing of a wait behind."""
@@ -535,10 +582,8 @@ class Lookups:
         found = self._look(wait, last_reset)
         if found is None and wait.blocked_by is not None:
             self.bus._check_waiter()
-            if self.share.end_reason is not None:
-                raise BusClosedError(self.share.end_reason) from wait.blocked_by
-            wait.sleep = self._fall_asleep(wait)
-            self.share.park(wait, wait.blocked_by)
+            wait.sleep, wait.wake = wake_up(running_loop())
+            self.park(wait, wait.blocked_by)
         return found
 
     def _look(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped | None:
@@ -552,9 +597,6 @@ class Lookups:
             if isinstance(error, UnknownFrameError):
                 self._check_names(wait.question)
             wait.blocked_by = without_traceback(error)
-        for other in wait.others:
-            with suppress(*MAY_COME):
-                self.lookup_nowait(other)
         return None
 
     def _last_answer(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:
@@ -565,19 +607,6 @@ class Lookups:
         target, source, *_ = wait.question
         missing = cast(TransformLookupError, wait.blocked_by)
         raise LookupTimeoutError(target=target, source=source, timeout=wait.patience, missing=missing) from missing
-
-    def _fall_asleep(self, wait: Wait) -> Generator[Any, None, None]:
-        """The sleep of a lookup, with a new wake-up. Its alarms are set the first time."""
-        loop = running_loop()
-        sleep, wait.wake = wake_up(loop)
-        if self._alarms is not None:
-            if self._looking_on is not loop:
-                self._look_after(max(REPORT_AFTER - to_seconds(self.now() - wait.since), 0.0))
-            if wait.patience == 0.0:
-                wait.expired = True
-            else:
-                self._set_end(wait, loop)
-        return sleep
 
     def _set_end(self, wait: Wait, loop: Any) -> None:
         """Set the alarm for the end of a wait, if it has an end and no alarm."""

@@ -9,8 +9,9 @@ import asyncio
 import logging
 import os
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sized
 from contextlib import AbstractContextManager, suppress
+from itertools import chain
 from threading import get_ident
 from types import TracebackType
 from typing import Any
@@ -222,14 +223,20 @@ class Bus:
         self._trees: dict[LiveTree, tuple[int, int] | None] = {}
         self._late: dict[LiveTree, LateBuffer] = {}
         self._streams: list[Stream] = []
+        # Everybody but the buffers: some containers, each with the function that gives a batch to all that is in it.
+        self._listeners: tuple[tuple[Sized, Callable[[Batch], object]], ...] = (
+            (self._streams, self._put_into_streams),
+            (self._events, self._note_in_events),
+            (self._subscribers.callbacks, self._subscribers.deliver),
+        )
         self._threads: list[ThreadPublisher] = []
         self._published = 0
         self._intake: Any = None
         self._take: Callable[[object, object], bool | None] = _take_nothing
         if Intake is not None:
-            listeners = self._subscribers.callbacks, self._streams, self._events
             busy = self._subscribers.calling, self._late
-            self._intake = Intake(self._topology.judge, TransformStamped, self._tell, listeners, busy)
+            listeners = tuple(chain.from_iterable(self._listeners))
+            self._intake = Intake(self._topology.judge, TransformStamped, listeners, busy)
             self._take = self._intake.take
         self._owner = OwnerThread(self._intake)
         # Whether this thread owns the bus, and has run an event loop with it. Called by buffers.
@@ -685,12 +692,17 @@ class Bus:
 
     def _tell(self, batch: Batch) -> None:
         """Give an accepted batch to everybody but the buffers."""
+        for listeners, give in self._listeners:
+            if listeners:
+                give(batch)
+
+    def _put_into_streams(self, batch: Batch) -> None:
         for stream in self._streams:
             stream.put(batch)
+
+    def _note_in_events(self, batch: Batch) -> None:
         for events in self._events:
             events.arrived(batch)
-        if self._subscribers.callbacks:
-            self._subscribers.deliver(batch)
 
     def _remove_if_known(self, frame: str) -> None:
         with suppress(UnknownFrameError):

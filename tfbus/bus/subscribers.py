@@ -163,6 +163,8 @@ class Subscribers:
         self._log = log
         self._announcer = announcer
         self.callbacks: dict[int, BatchCallback] = {}
+        # Made anew at each change, because a batch is published far more often.
+        self._in_order: tuple[tuple[int, BatchCallback], ...] = ()
         self._removal_callbacks: dict[int, FrameCallback] = {}
         self._keys = count()
         self._backlog: deque[Batch] = deque()
@@ -180,6 +182,7 @@ class Subscribers:
                 raise TypeError(f"a subscriber must not be async, as {function!r} is: read a bus.stream() instead")
         key = next(self._keys)
         self.callbacks[key] = callback
+        self._in_order = tuple(self.callbacks.items())
         if removed is not None:
             self._removal_callbacks[key] = removed
         if latched:
@@ -197,11 +200,15 @@ class Subscribers:
 
     def deliver(self, batch: Batch) -> None:
         """Call every subscriber with a batch: now or, inside a callback, after the batches before it."""
-        self._backlog.append(batch)
         if self.calling:
+            self._backlog.append(batch)
             self._queued += 1
-        else:
-            self._deliver_backlog()
+            return
+        if self._backlog:
+            # Ctrl-C has left some.
+            self._backlog.append(batch)
+            batch = self._backlog.popleft()
+        self._give(batch)
 
     def discard_moving(self) -> None:
         """Take the moving samples out of the batches that are not delivered yet: the clock has jumped back."""
@@ -225,22 +232,29 @@ class Subscribers:
 
     def _deliver_backlog(self) -> None:
         """Deliver all batches, unless a callback runs: then its caller delivers them."""
-        if self.calling:
-            return
+        if self._backlog and not self.calling:
+            self._give(self._backlog.popleft())
+
+    def _give(self, batch: Batch) -> None:
+        """Call every subscriber with a batch, then with those of the backlog."""
+        callbacks = self.callbacks
         try:
-            while self._backlog:
-                self._current = self._backlog.popleft()
-                for key in tuple(self.callbacks):
+            while True:
+                self._current = batch
+                for key, callback in self._in_order:
                     # A callback may have closed another registration, or removed a frame of the batch.
-                    callback = self.callbacks.get(key)
-                    if callback is not None and self._current:
+                    if key in callbacks and self._current:
                         self._call(key, callback, self._current)
+                if not self._backlog:
+                    return
+                batch = self._backlog.popleft()
         finally:
             self._current = ()
             self._queued = 0
 
     def _remove(self, key: int) -> None:
         self.callbacks.pop(key, None)
+        self._in_order = tuple(self.callbacks.items())
         self._removal_callbacks.pop(key, None)
 
     def _call(self, key: int, callback: Callable[[GivenT], object], given: GivenT) -> None:

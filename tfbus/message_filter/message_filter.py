@@ -1,8 +1,28 @@
 """A filter that pairs each message with the transform of its own stamp, as soon as that is known.
 
-One task reads the source. A message whose transform is known on arrival is ready at once. Any other message gets a task
-that waits for its transforms, so there are never more than `capacity` tasks. No task raises: a message that fails is
-dropped, and an error of the source is kept for the reader.
+::
+
+    source ──> reads ──> ready ────────────────────────────> reader
+                 │         ^ ^
+                 v         │ └────────────────┐
+              parked ── publish ──> due ──> attends ──> dropped
+                 ^        timeout, end ^       │
+                 └─────────────────────────────┘
+
+One task reads the source. A message whose transform is known on arrival is ready at once. Any other is parked in the
+buffer's index as a lookup is, but no task sleeps for it: the insertion that unblocks it calls a function.
+
+* If the insertion hands over the answer, the message is ready before `publish` returns. With one target and no
+  margin this is the usual end of a wait.
+* Otherwise the message is due, and a task, the attendant, asks again: it makes the message ready, parks it once more,
+  or drops it. So it is with several targets, after a change of the target, when the time of the message is up, when its
+  transform can no longer come, and when the buffer is closed. One attendant serves all messages that are due.
+
+The function runs inside a publish, where no code of the user may run: `on_drop` is called by the tasks only, and when
+the clock jumps back. No task raises an `Exception`: a message that fails is dropped, and an error of the source is kept
+for the reader.
+
+A clock that is not a class of tfbus has no alarms: there each waiting message takes a task that keeps the time.
 """
 
 import logging
@@ -10,20 +30,22 @@ import math
 import warnings
 from bisect import bisect_left, insort
 from collections import Counter
-from collections.abc import AsyncGenerator, AsyncIterable, Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import AsyncGenerator, AsyncIterable, Callable, Sequence
+from functools import partial
 from inspect import iscoroutinefunction
 from itertools import count
 from operator import attrgetter
 from types import TracebackType
-from typing import Generic, Literal, TypeVar, cast, overload
+from typing import Generic, Literal, NamedTuple, TypeVar, cast, overload
 
 import anyio
 import anyio.abc
 import anyio.lowlevel
 
+from tfbus._aio.loops import checkpoint
 from tfbus._aio.task_groups import OneReader, close_task_group, raise_unchanged
 from tfbus.buffer.buffer import Buffer
+from tfbus.buffer.lookups import REPORT_AFTER, Wait
 from tfbus.bus.queues import check_capacity
 from tfbus.bus.subscribers import OnceLogger
 from tfbus.errors import (
@@ -42,6 +64,7 @@ from tfbus.rows import IDENTITY
 from tfbus.stamps import LATEST, STAMP_MAX, Latest, as_duration, as_stamp, from_seconds
 from tfbus.tree.lookup import Question
 from tfbus.tree.tree import forest_of
+from tfbus.waiting.live_tree import without_traceback
 
 MessageT = TypeVar("MessageT")
 
@@ -110,22 +133,22 @@ class PendingMessage(Generic[MessageT, AnswerT]):
     ----------
     answer : transform or tuple of transforms, or None
         Delivered with the message; None while it waits.
-    stop_waiting : callable
-        Ends the wait for the answer.
+    wait : Wait or None
+        Its lookup, from the first time that it is parked until it has its answer or is dropped.
     number : int
         Number of messages that arrived before it.
     place : tuple of int or None
         Its place in the order of delivery: its rank, then its number.
     """
 
-    __slots__ = ("answer", "frame", "message", "number", "place", "stamp", "stop_waiting")
+    __slots__ = ("answer", "frame", "message", "number", "place", "stamp", "wait")
 
     def __init__(self, message: MessageT, frame: str, stamp: int | Latest) -> None:
         self.message = message
         self.frame = frame
         self.stamp = stamp
         self.answer: AnswerT | None = None
-        self.stop_waiting: Callable[[], object] = _nothing
+        self.wait: Wait | None = None
         self.number = -1
         self.place: tuple[int, int] | None = None
 
@@ -227,8 +250,15 @@ class MessageQueue(Generic[MessageT, AnswerT]):
         insort(self._line, pending.place)
 
 
-def _nothing() -> None:
-    """Do nothing: no wait has been started."""
+Asked = tuple[str, str, int | Latest]
+"""A question of a message: target, source, and stamp in ns."""
+
+
+class Blocked(NamedTuple):
+    """The questions of a message that has no answer yet, the one that lacks something first, and its error."""
+
+    questions: list[Asked]
+    error: TransformLookupError
 
 
 class Targets(Generic[AnswerT]):
@@ -242,6 +272,11 @@ class Targets(Generic[AnswerT]):
     tolerance : float
         In s. The transform this much later has to be known too.
 
+    Attributes
+    ----------
+    one : bool
+        Whether an answer is a transform.
+
     Raises
     ------
     UnknownFrameError
@@ -252,70 +287,53 @@ class Targets(Generic[AnswerT]):
 
     def __init__(self, buffer: Buffer, target: str | Sequence[str], tolerance: float) -> None:
         self._buffer = buffer
-        self._one = isinstance(target, str)
-        self._names = self._names_of(target)
+        self.one = isinstance(target, str)
         self._tolerance = from_seconds(as_duration(tolerance, "margin"))
+        self.replace(target)
 
     def replace(self, target: str | Sequence[str]) -> None:
         """Change the targets; `TypeError` unless both are one frame, or both a sequence."""
-        if isinstance(target, str) is not self._one:
-            wanted = "one target" if self._one else "a sequence of targets"
+        if isinstance(target, str) is not self.one:
+            wanted = "one target" if self.one else "a sequence of targets"
             raise TypeError(f"the filter was made for {wanted}, and its pairs keep their shape: not {target!r}")
         self._names = self._names_of(target)
 
-    def questions(self, frame: str, stamp: int | Latest) -> Iterator[tuple[str, int | Latest]]:
-        """The targets and stamps (ns) to look up; the last one of each target gives its transform."""
-        for target in self._names:
-            if target == frame:
-                continue
-            if self._tolerance and not isinstance(stamp, Latest):
-                yield target, min(stamp + self._tolerance, STAMP_MAX)
-            yield target, stamp
+    def questions(self, frame: str, stamp: int | Latest) -> list[Asked]:
+        """The questions of a message; the last one of each target gives its transform."""
+        if not self._tolerance or isinstance(stamp, Latest):
+            return [(target, frame, stamp) for target in self._names if target != frame]
+        later = min(stamp + self._tolerance, STAMP_MAX)
+        return [(target, frame, at) for target in self._names if target != frame for at in (later, stamp)]
 
-    def lookup_nowait(self, frame: str, stamp: int | Latest) -> AnswerT:
-        """The answer, or an error at once.
+    def plain(self, questions: list[Asked]) -> AnswerT | None:
+        """The answer if it is the plain one of an only question; None where one has to look closer."""
+        if not self.one or len(questions) != 1:
+            return None
+        return cast(AnswerT | None, self._buffer._paths.answer(*questions[0]))
+
+    def look(self, frame: str, stamp: int | Latest) -> AnswerT | Blocked:
+        """The answer, or what blocks it.
 
         Raises
         ------
         TransformLookupError
-            If there is none. Among several errors, an error that waiting cannot help is raised first.
+            If there is no answer, and waiting cannot help.
         """
         now = self._buffer.bus.clock.now() if isinstance(stamp, Latest) else stamp
         found = {frame: answer_of(frame, frame, now, IDENTITY, static=True)}
-        blocker: TransformLookupError | None = None
-        for target, at in self.questions(frame, stamp):
+        questions = self.questions(frame, stamp)
+        blocked: Blocked | None = None
+        for asked in questions:
             try:
-                found[target] = self._buffer.lookup_nowait(target, frame, at)
+                found[asked[0]] = self._buffer.lookup_nowait(*asked)
             except MAY_COME as error:
-                blocker = blocker or error
-        if blocker is not None:
-            raise blocker
+                if blocked is None:
+                    others = [other for other in questions if other is not asked]
+                    blocked = Blocked([asked, *others], without_traceback(error))
+        if blocked is not None:
+            return blocked
         answers = tuple(found[target] for target in self._names)
-        return cast(AnswerT, answers[0] if self._one else answers)
-
-    async def wait(self, frame: str, stamp: int | Latest) -> None:
-        """Wait until each question has had an answer; the errors are as in `Buffer.lookup`."""
-        await self._buffer._lookup_among([Question(target, frame, at) for target, at in self.questions(frame, stamp)])
-
-    def blocker(self, frame: str, stamp: int | Latest) -> TransformLookupError | None:
-        """The error that an answer has now; None if there is an answer."""
-        try:
-            self.lookup_nowait(frame, stamp)
-        except TransformLookupError as error:
-            return error
-        return None
-
-    def lookup_at_timeout(self, frame: str, stamp: int | Latest, timeout: float) -> AnswerT:
-        """The answer for a message that has waited `timeout` s; `LookupTimeoutError` where waiting might still help."""
-        try:
-            return self.lookup_nowait(frame, stamp)
-        except MAY_COME:
-            for target, at in self.questions(frame, stamp):
-                try:
-                    self._buffer.lookup_nowait(target, frame, at)
-                except MAY_COME as blocker:
-                    raise LookupTimeoutError(target=target, source=frame, timeout=timeout, missing=blocker) from blocker
-            raise
+        return cast(AnswerT, answers[0] if self.one else answers)
 
     def _names_of(self, target: str | Sequence[str]) -> tuple[str, ...]:
         names = (target,) if isinstance(target, str) else tuple(target)
@@ -470,6 +488,8 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
         self._registrations: list[Registration] = []
         self._error: BaseException | None = None
         self._exhausted = False
+        self._lookups = buffer._lookups
+        self._due: dict[PendingMessage[MessageT, AnswerT], None] = {}
         self._reader = OneReader()
         self._room: anyio.Event | None = None
 
@@ -517,7 +537,7 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
         """
         self._targets.replace(target)
         for pending in self._pending.waiting:
-            pending.stop_waiting()
+            self._make_due(pending)
 
     async def __aenter__(self) -> "MessageFilter[MessageT, AnswerT]":
         if self._tasks is not None:
@@ -546,8 +566,11 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
         finally:
             for registration in self._registrations:
                 registration.close()
-            for pending in self._pending.messages:
+            # They stay due, because no attendant comes if a callback changes the target.
+            self._due = dict.fromkeys(self._pending.messages)
+            for pending in self._due:
                 self._drop(pending, "closed", self._blocker(pending))
+            self._due.clear()
         if error is None:
             self._raise_error()
 
@@ -558,26 +581,28 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
         if self._tasks is None:
             raise RuntimeError("enter the message filter first: async with MessageFilter(...) as pairs")
         with self._reader:
-            await anyio.lowlevel.checkpoint()
+            await checkpoint()
             while (ready := self._pending.pop_ready()) is None:
                 self._raise_error()
                 if self._exhausted and not self._pending.unanswered:
                     raise StopAsyncIteration
                 await self._reader.wait()
         self._delivered += 1
-        self._wake()
+        if self._room is not None:
+            self._room.set()
         return ready
 
     async def _read_source(self, scope: anyio.CancelScope) -> None:
         try:
             with scope:
-                await anyio.lowlevel.checkpoint()
+                await checkpoint()
                 messages = aiter(self._messages)
                 try:
                     async for message in messages:
                         self._accept(message)
-                        await anyio.lowlevel.checkpoint()
-                        await self._make_room()
+                        await checkpoint()
+                        while self._overflow == "block" and self._pending.full:
+                            await self._wait_for_room()
                 finally:
                     if isinstance(messages, AsyncGenerator):
                         await messages.aclose()
@@ -592,13 +617,12 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
             self._exhausted = True
             self._wake()
 
-    async def _make_room(self) -> None:
-        while self._overflow == "block" and self._pending.full:
-            self._room = anyio.Event()
-            try:
-                await self._room.wait()
-            finally:
-                self._room = None
+    async def _wait_for_room(self) -> None:
+        self._room = anyio.Event()
+        try:
+            await self._room.wait()
+        finally:
+            self._room = None
 
     def _accept(self, message: MessageT) -> None:
         frame, stamp = self._frame(message), self._stamp(message)
@@ -610,63 +634,114 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
             known = forest_of(self.buffer.tree).some_frames()
             self._drops.drop(message, "unknown frame", UnknownFrameError(frame=frame, known=known))
             return
-        answer: AnswerT | None = None
-        blocker: TransformLookupError | None = None
-        try:
-            if self._timeout:
-                answer = self._targets.lookup_nowait(frame, stamp)
-            else:
-                answer = self._targets.lookup_at_timeout(frame, stamp, 0.0)
-        except MAY_COME as error:
-            blocker = error
-        except TransformLookupError as error:
-            self._drops.drop(message, reason_of(error), error)
-            return
-        if self._pending.full and self._overflow == "drop_newest":
-            self._drops.drop(message, "queue full", blocker)
-            return
-        dropped = [self._pending.oldest] if self._pending.full else []
-        lacking = [self._blocker(pending) for pending in dropped]
-        for pending in dropped:
-            self._remove(pending)
-        self._enqueue(PendingMessage(message, frame, stamp), answer)
-        # Last, so that the callback finds consistent counters.
-        for pending, lack in zip(dropped, lacking, strict=True):
-            self._drops.drop(pending.message, "queue full", lack)
-
-    def _enqueue(self, pending: PendingMessage[MessageT, AnswerT], answer: AnswerT | None) -> None:
-        assert self._tasks is not None
+        pending: PendingMessage[MessageT, AnswerT] = PendingMessage(message, frame, stamp)
+        questions = self._targets.questions(frame, stamp)
+        found: AnswerT | Blocked | None = self._targets.plain(questions)
+        if found is None and (self._pending.full or not self._park(pending, questions)):
+            try:
+                found = self._look(pending)
+            except TransformLookupError as error:
+                self._forget_wait(pending)
+                self._drops.drop(message, reason_of(error), error)
+                return
+        oldest, lacking = None, None
+        if self._pending.full:
+            if self._overflow == "drop_newest":
+                self._drops.drop(message, "queue full", found.error if isinstance(found, Blocked) else None)
+                return
+            oldest = self._pending.oldest
+            lacking = self._blocker(oldest)
+            self._remove(oldest)
         self._pending.append(pending)
-        if answer is not None:
-            self._answer(pending, answer)
-        else:
-            self._tasks.start_soon(self._wait, pending)
+        if found is not None:
+            self._give(pending, found)
+        if oldest is not None:
+            # Last, so that the callback finds consistent counters.
+            self._drops.drop(oldest.message, "queue full", lacking)
 
-    async def _wait(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
-        """Wait until a message has its answer, cannot have one, or has timed out."""
-        frame, stamp = pending.frame, pending.stamp
-        try:
-            with self.buffer.bus.clock.move_on_after(self._timeout):
-                while self._pending.is_waiting(pending):
-                    # Cancelled when the message is dropped or the targets change.
-                    with anyio.CancelScope() as scope:
-                        pending.stop_waiting = scope.cancel
-                        await self._targets.wait(frame, stamp)
-                    if self._pending.is_waiting(pending):
-                        with suppress(*MAY_COME):
-                            self._answer(pending, self._targets.lookup_nowait(frame, stamp))
-            if self._pending.is_waiting(pending):
-                self._answer(pending, self._targets.lookup_at_timeout(frame, stamp, self._timeout))
-        except TransformError as error:
-            self._drop(pending, reason_of(error), error)
+    def _look(self, pending: PendingMessage[MessageT, AnswerT]) -> AnswerT | Blocked:
+        """The answer of a message, or what blocks it; `LookupTimeoutError` if its time is up and waiting might help."""
+        found = self._targets.look(pending.frame, pending.stamp)
+        expired = not self._timeout if pending.wait is None else pending.wait.expired
+        if not expired or not isinstance(found, Blocked):
+            return found
+        target, source, _ = found.questions[0]
+        error = found.error
+        raise LookupTimeoutError(target=target, source=source, timeout=self._timeout, missing=error) from error
 
-    def _answer(self, pending: PendingMessage[MessageT, AnswerT], answer: AnswerT) -> None:
+    def _give(self, pending: PendingMessage[MessageT, AnswerT], found: AnswerT | Blocked) -> None:
+        """Make a message in the queue ready, or let it wait for what it lacks; drop it if no more samples will come."""
+        if isinstance(found, Blocked):
+            try:
+                self._park(pending, *found)
+            except BusClosedError as error:
+                self._drop(pending, reason_of(error), error)
+            return
         tree = self.buffer.tree
-        self._pending.set_answer(pending, answer, moment=tree.inserted + tree.replaced)
-        self._wake()
+        self._forget_wait(pending)
+        self._pending.set_answer(pending, found, moment=tree.inserted + tree.replaced)
+        self._reader.wake()
+
+    def _park(
+        self,
+        pending: PendingMessage[MessageT, AnswerT],
+        questions: list[Asked],
+        error: TransformLookupError | None = None,
+    ) -> bool:
+        """Let a message wait, as `Lookups.park` does, with what it returns and raises."""
+        wait = pending.wait
+        if wait is None:
+            if not questions or not self._timeout:
+                return False
+            wait = pending.wait = Wait((), self.buffer.bus.clock.now(), partial(self._woken, pending))
+            wait.patience = self._timeout
+        wait.asked, *wait.others = [self.buffer._on_bus(Question(*asked)) for asked in questions]
+        waits = self._lookups.park(wait, error)
+        if waits and wait.cancel_end is None and not self._lookups.has_alarms and self._tasks is not None:
+            self._tasks.start_soon(self._keep_time, wait, scope := anyio.CancelScope())
+            wait.cancel_end = scope.cancel
+        return waits
+
+    def _woken(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
+        """Take the answer of an insertion, or let the attendant ask again. Called inside a publish, or by an alarm."""
+        wait = pending.wait
+        if wait is None or pending in self._due:
+            return
+        answer = self._lookups.given(wait) if self._targets.one and not wait.others else None
+        if answer is None:
+            self._make_due(pending)
+        else:
+            self._give(pending, cast(AnswerT, answer))
+
+    def _make_due(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
+        if not self._due and self._tasks is not None:
+            self._tasks.start_soon(self._attend)
+        self._due[pending] = None
+
+    async def _attend(self) -> None:
+        """Ask again for each message that is due: answer it, let it wait on, or drop it."""
+        while self._due:
+            pending = next(iter(self._due))
+            if self._pending.is_waiting(pending):
+                try:
+                    self._give(pending, self._look(pending))
+                except TransformError as error:
+                    self._drop(pending, reason_of(error), error)
+            self._due.pop(pending, None)
+
+    async def _keep_time(self, wait: Wait, scope: anyio.CancelScope) -> None:
+        """Log a wait that takes long, and end it after the timeout, by a clock that knows no alarms."""
+        clock = self.buffer.bus.clock
+        with scope:
+            with clock.move_on_after(self._timeout):
+                while True:
+                    await clock.sleep(REPORT_AFTER)
+                    self._lookups.report()
+            wait.expire()
 
     def _blocker(self, pending: PendingMessage[MessageT, AnswerT]) -> TransformLookupError | None:
-        return None if pending.answer is not None else self._targets.blocker(pending.frame, pending.stamp)
+        """The error that blocks a message now; None for one with an answer."""
+        return None if pending.wait is None else self._lookups.blocker(pending.wait)
 
     def _clock_jumped(self, before: int, after: int) -> None:
         if after < before:
@@ -682,8 +757,14 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
 
     def _remove(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
         self._pending.remove(pending)
-        pending.stop_waiting()
+        self._forget_wait(pending)
         self._wake()
+
+    def _forget_wait(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
+        # The wait refers to the message: without this line they form a reference cycle.
+        wait, pending.wait = pending.wait, None
+        if wait is not None:
+            self._lookups.end(wait)
 
     def _wake(self) -> None:
         self._reader.wake()

@@ -28,7 +28,7 @@ wake a waiter is to call the function that it brought along: nothing here knows 
 
 import logging
 from bisect import bisect_left, insort
-from collections.abc import Callable, Container, Hashable, Iterable, KeysView
+from collections.abc import Callable, Container, Hashable, Iterable, KeysView, Sequence
 from dataclasses import astuple, dataclass
 from itertools import count, takewhile
 from operator import sub
@@ -159,7 +159,7 @@ class Waiter(Parked):
 
     Attributes
     ----------
-    others : tuple of Question
+    others : sequence of Question
         Further questions that need an answer: the waiter is woken when one of them can no longer have an answer.
     blocked_by : TransformLookupError or None
         The error with which it was parked; None if the kernel has parked it, because newer samples are all it lacks.
@@ -169,7 +169,7 @@ class Waiter(Parked):
         Whether the index has noted the names of its questions.
     """
 
-    others: tuple[Question, ...] = ()
+    others: Sequence[Question] = ()
     blocked_by: TransformLookupError | None = None
     limits: list[tuple[str, Place]] | None = None
     indexed = False
