@@ -341,7 +341,7 @@ def test_an_array_that_does_not_end_in_3_is_refused_with_its_shape(shape: tuple[
 def test_a_sequence_that_is_not_a_point_is_refused_with_its_shape(point: Any) -> None:
     with pytest.raises(ValueError, match=rf"\({len(point)},\)"):
         Transform.identity().apply(point)
-    with pytest.raises(ValueError, match="a point is three numbers, not .*; points go in an array"):
+    with pytest.raises(ValueError, match=r"a point is three numbers, not .*; points go in an array"):
         Transform.identity().apply([[1.0, 2.0, 3.0]] * 3)  # type: ignore[list-item]
 
 
