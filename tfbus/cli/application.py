@@ -13,6 +13,8 @@ from functools import partial
 from io import TextIOWrapper
 from typing import Annotated, Any, Final, Literal, get_args
 
+from tfbus.tf2_names import ours
+
 FAILED, USAGE_ERROR, INTERRUPTED, ENDED_BY_SIGNAL = 1, 2, 130, 128
 """The exit statuses; the number of a signal is added to the last one."""
 
@@ -79,7 +81,11 @@ def run(words: Sequence[str], loaded: Callable[[], object] = lambda: None) -> in
         sys.stdout.reconfigure(errors="backslashreplace")
     # `info` is a level of the log, too.
     named = (word for before, word in zip(("", *words), words, strict=False) if before != "--log-level")
-    command = next((word for word in named if word in COMMANDS), None)
+    plain = [word for word in named if not word.startswith("-")]
+    command = next((word for word in plain if word in COMMANDS), None)
+    if command is None and plain and (hint := ours("command", plain[0])):
+        print(f"tfbus: there is no command {plain[0]!r}: {hint}", file=sys.stderr)
+        return USAGE_ERROR
     app = None if tuple(words) in _PAGES else application(command)
     status = 0
     try:
