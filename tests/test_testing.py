@@ -53,8 +53,8 @@ async def test_assert_close_takes_transforms_and_samples_up_to_the_sign_of_the_r
 
 
 async def test_assert_close_says_how_far_apart_they_are() -> None:
-    with pytest.raises(AssertionError, match=r"is 2 m and 0\.5 rad from .*allowed: 0\.1 m, 1e-09 rad"):
-        assert_close(Transform(), Transform.from_axis_angle((0, 0, 1), 0.5, (0.0, 2.0, 0.0)), translation_tolerance=0.1)
+    with pytest.raises(AssertionError, match=r"is 3 m and 0\.5 rad from .*allowed: 0\.1 m, 1e-09 rad"):
+        assert_close(Transform(), Transform.from_axis_angle((0, 0, 1), 0.5, (0.0, 3.0, 0.0)), translation_tolerance=0.1)
 
 
 def test_a_registration_is_undone_once_also_after_an_error_and_if_it_is_closed_again() -> None:

@@ -64,8 +64,11 @@ def test_a_translation_beyond_the_bound_is_refused_at_the_door_of_a_bus(bus: Bus
     if known:
         bus.publish(moving("a", "b", NOW, 1e12))
     for far in ((1.1e12, 0.0, 0.0), (0.0, -1.1e12, 0.0), (0.0, 0.0, 1e308)):
-        with pytest.raises(InvalidTransformError, match="not physical"):
-            bus.publish([moving("a", "b", NOW + 1, 1.0), TransformStamped("a", "b", NOW + 2, Transform(far))])
+        with pytest.raises(InvalidTransformError, match="not physical") as caught:
+            bus.publish([moving("a", "b", NOW + 1, 1.0), TransformStamped("a", "b", NOW + 2, Transform(far), "peer")])
+    assert str(caught.value) == (
+        "the translation of 'b' in 'a' is 1e+308 m long, which is not physical (at most 1e+12 m), from 'peer'"
+    )
     bus.publish([moving("a", "b", NOW + 3, 2e12), moving("a", "b", NOW + 4, 5.0)], invalid="drop")
     assert bus.statistics().rejected == {"not physical": 4}
     assert buffer.lookup_nowait("a", "b", NOW + 4).transform.translation == (5.0, 0.0, 0.0)

@@ -297,6 +297,7 @@ def test_a_signal_ends_it_silently_whenever_it_comes(number: signal.Signals) -> 
     assert statuses <= {-number, 128 + number}
 
 
+@pytest.mark.thorough
 def test_where_ctrl_c_is_ignored_a_termination_ends_it() -> None:
     script = 'trap "" INT; exec "$0" tree --domain "$1"'
     with Program("sh", "-c", script, TFBUS, new_domain()) as tree:

@@ -204,6 +204,23 @@ def test_ctrl_c_is_raised_even_if_the_function_ends_by_itself_and_an_error_witho
             run(main, backend)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_ctrl_c_stays_ignored_where_it_was_ignored(backend: str) -> None:
+    done = []
+
+    async def main() -> None:
+        press_ctrl_c()
+        await anyio.sleep(0.01)
+        done.append(backend)
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        run(main, backend)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert done == [backend]
+
+
 THEN = 1_400_000_000 * SECOND
 
 
