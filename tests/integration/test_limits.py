@@ -27,6 +27,7 @@ BOUNDS = [
         ("links.link", "_MAX_BYTES MANY"),
         ("links.endpoint", "MAX_PEERS MAX_AUTHORITIES MOST_AUTHORITY_TEXT"),
         ("links.domain", "MOST_WAITING"),
+        ("links.relay", "MOST_ORIGINS"),
         ("links.replica", "MANY_ORIGINS MOST_REMOVALS MOST_REMEMBERED CHUNK PATIENCE"),
         ("links.domain", "MOST_QUESTIONS SOONEST_SIGN MOST_ROBOTS"),
         ("links.channels", "MOST_FILTERS LONGEST_FILTER"),
