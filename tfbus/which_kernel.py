@@ -1,7 +1,4 @@
-"""The choice between the compiled kernel and its twin in Python. Other modules import every twin from here.
-
-The environment variable ``TFBUS_KERNEL`` asks for ``python`` or ``compiled``. Without it, the compiled kernel runs if
-it was built and can be loaded.
+"""The parts of the kernel that runs. Other modules import every twin from here; `tfbus.running_kernel` chooses.
 
 `tfbus._python_kernel` is the definition: ``_c_kernel/`` does the same, with the same bits. The fast paths of publishing
 and waiting exist in C only, because in Python they would not be faster than the ordinary ones: `Intake` takes a plain
@@ -10,39 +7,17 @@ asks and parks the plain ones.
 """
 
 import functools
-import importlib
-import os
 from collections.abc import Callable
 from typing import Any, Final, Literal, TypeVar, cast
+
+from tfbus.running_kernel import running_kernel
+from tfbus.stamps import LATEST
 
 Kernel = Literal["compiled", "python"]
 MethodT = TypeVar("MethodT", bound=Callable[..., Any])
 
 
-def _choose(wanted: str | None) -> Kernel:
-    """The kernel that runs.
-
-    Raises
-    ------
-    ImportError
-        If the compiled kernel is asked for and cannot be loaded.
-    ValueError
-        If something else is asked for.
-    """
-    if wanted == "python":
-        return "python"
-    if wanted not in (None, "", "compiled"):
-        raise ValueError(f"TFBUS_KERNEL must be 'python' or 'compiled', not {wanted!r}")
-    try:
-        importlib.import_module("tfbus._kernel")
-    except ImportError:
-        if wanted == "compiled":
-            raise
-        return "python"
-    return "compiled"
-
-
-kernel: Final = _choose(os.environ.get("TFBUS_KERNEL"))
+kernel: Final = cast(Kernel, running_kernel)
 """The kernel that runs in this process."""
 
 if kernel == "python":
@@ -142,8 +117,6 @@ def plain_first(method: MethodT, many: type | None = None) -> MethodT:
         return cast(MethodT, Method(method, many))
     if many is not None:
         return method
-    # Here, because it loads numpy, which `tfbus --version` does without.
-    from tfbus.stamps import LATEST
 
     @functools.wraps(method)
     def first(self: Any, target: str, source: str, at: Any = LATEST, **options: Any) -> Any:

@@ -301,7 +301,7 @@ class EventStream(OneReaderStream[Event]):
         detach: Callable[["EventStream"], object],
     ) -> None:
         super().__init__(check_thread, detach)
-        implausible = [*topology.known_ahead(), *topology.known_behind()]
+        implausible: list[StampAhead | StampBehind] = [*topology.known_ahead(), *topology.known_behind()]
         self.queue = EventQueue(capacity, topology.known(), implausible)
         self._staleness: Staleness | None = None
         if stale_after is not None and as_duration(stale_after, "stale_after") != math.inf:
