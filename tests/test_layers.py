@@ -19,6 +19,7 @@ GROUND = (
     "events",
     "frames",
     "registration",
+    "tf2_names",
     "statistics",
     "rows",
     "_python_kernel",
@@ -216,7 +217,7 @@ def test_every_door_says_what_its_room_is_for() -> None:
 def loaded_by(statement: str) -> set[str]:
     """The packages that a statement loads in a new process."""
     script = f"import sys; {statement}; print(*sorted({{name.partition('.')[0] for name in sys.modules}}))"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, check=True)
     return set(done.stdout.split())
 
 

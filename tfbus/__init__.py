@@ -112,7 +112,10 @@ def __getattr__(name: str) -> object:
     elif name in _ROOMS:
         return import_module(f"tfbus.{name}")
     else:
-        raise AttributeError(f"module 'tfbus' has no attribute {name!r}")
+        from tfbus.tf2_names import ours
+
+        hint = ours("tfbus", name)
+        raise AttributeError(f"module 'tfbus' has no attribute {name!r}" + (f": {hint}" if hint else ""))
     globals()[name] = value
     return value
 

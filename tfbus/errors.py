@@ -4,7 +4,7 @@
 
     TransformError
         TransformLookupError (LookupError)
-            UnknownFrameError                  .frame .close_matches          waiting may help
+            UnknownFrameError                  .frame .close_matches .missed  waiting may help
             DisconnectedError                  .target .source .roots         waiting may help
             ExtrapolationError                 .child .stamp .oldest .newest .authority
                 FutureExtrapolationError                                      waiting may help
@@ -33,7 +33,7 @@ from itertools import islice
 from typing import Any, Self, TypeVar, get_type_hints
 
 from tfbus.plain import from_fields, from_plain, printable, to_plain
-from tfbus.stamps import Latest, format_duration, format_stamp, likely_cause
+from tfbus.stamps import SECOND, Latest, format_duration, format_stamp, likely_cause
 
 MOST_NAMES = 2_000
 """The number of known names that an error about an unknown name keeps."""
@@ -167,9 +167,13 @@ class UnknownFrameError(TransformLookupError):
     close_matches : tuple of str
         Frames with a similar name, the most similar first, among the frames that were known when the error was raised;
         if these were many, only some of them are searched. Computed when first read.
+    missed : bool
+        Whether the bus of the buffer has the frame, but no sample of it came since the buffer was made: a buffer begins
+        with what is latched, or with its `prefill`.
     """
 
     frame: str
+    missed: bool = False
     _known: tuple[str, ...] = ()
 
     def __init__(self, *, frame: str, known: Iterable[str] = ()) -> None:
@@ -184,6 +188,8 @@ class UnknownFrameError(TransformLookupError):
         return _close_matches(self.frame.lstrip("/"), self._known)
 
     def _why(self) -> str:
+        if self.missed:
+            return f"frame {self.frame!r} is not known: its samples came before this buffer was made, see prefill"
         hint = " or ".join(repr(name) for name in self.close_matches)
         slash = ", a frame name has no leading slash" if self.frame.startswith("/") else ""
         return f"frame {self.frame!r} is not known{slash}" + (f", did you mean {hint}?" if hint else "")
@@ -281,6 +287,8 @@ class ExtrapolationError(TransformLookupError):
     ahead : int
         The time from the clock's now to the edge's newest stamp, in ns, if it exceeds the `max_ahead` of the bus: then
         correct samples are older, and may have expired. Otherwise 0, as in all errors of a tree without a bus.
+    max_age : int or None
+        The `max_age` that the newest answer of a buffer exceeds, in ns; None if another reason decides.
     """
 
     child: str
@@ -290,6 +298,7 @@ class ExtrapolationError(TransformLookupError):
     authority: str
     slack: int
     ahead: int = 0
+    max_age: int | None = None
 
     def __init__(
         self,
@@ -321,10 +330,30 @@ class ExtrapolationError(TransformLookupError):
         if self.ahead:
             ahead = format_duration(self.ahead)
             sender += f"; its newest stamp is {ahead} ahead of the clock, and right samples expire"
-        if self.newest is not None and not isinstance(self.stamp, Latest):
-            cause = likely_cause(self.stamp, self.newest)
-            sender += f": {cause}" if cause else ""
+        if self.max_age is not None and self.newest is not None and not isinstance(self.stamp, Latest):
+            return f"frame {self.child!r}: {self._age(self.newest, self.stamp, self.max_age)}{sender}"
+        cause = self._cause()
+        sender += f": {cause}" if cause else ""
         return f"frame {self.child!r}: asked for {self._asked()}, {self._gap()}{sender}"
+
+    def _age(self, newest: int, stamp: int, max_age: int) -> str:
+        """The age of the newest sample, and the greatest that the lookup allows."""
+        age, most = format_duration(stamp + max_age - newest), format_duration(max_age + self.slack)
+        return f"newest sample is {age} old, and may be {most} old (max_age)"
+
+    def _cause(self) -> str:
+        """The likely cause, in words, if the stamp that was asked is far from all samples; else empty."""
+        if self.newest is None or isinstance(self.stamp, Latest):
+            return ""
+        if self.stamp == 0 and self.oldest is not None and self.oldest > 0:
+            return "was this stamp never set? For the newest, ask at LATEST, not at 0"
+        cause = likely_cause(self.stamp, self.newest)
+        if not cause or not 0 < self.stamp < self.newest:
+            return cause
+        if cause.startswith("seconds"):
+            return f"{cause} from_seconds({self.stamp}) is that stamp"
+        # No robot asks for its first millisecond, and a program that begins often asks for a round number of seconds.
+        return f"for seconds write from_seconds({self.stamp})" if self.stamp < SECOND // 1_000 else cause
 
 
 class FutureExtrapolationError(ExtrapolationError):
@@ -392,6 +421,10 @@ class AheadError(ExtrapolationError):
 
     def _asked(self) -> str:
         return f"the latest up to {super()._asked()}"
+
+    def _age(self, newest: int, stamp: int, max_age: int) -> str:
+        ahead, most = format_duration(newest - stamp + max_age), format_duration(max_age)
+        return f"newest sample is {ahead} ahead of the clock, and may be {most} ahead (max_age)"
 
     def _gap(self) -> str:
         if self.newest is None or isinstance(self.stamp, Latest):

@@ -1,5 +1,6 @@
 """Frame names, and the prefixes that keep the names of several robots apart on one bus."""
 
+import logging
 from collections.abc import Iterable
 
 from tfbus.errors import InvalidTransformError
@@ -29,7 +30,8 @@ class Prefix:
     Parameters
     ----------
     prefix : str
-        The text before each local name. A slash between the two must be part of the prefix, as in ``"robot1/"``.
+        The text before each local name. A slash between the two must be part of the prefix, as in ``"robot1/"``; a
+        prefix that ends in a letter or a digit is logged.
     shared : iterable of str
         Names that are the same for all robots, such as ``{"map"}``.
 
@@ -53,6 +55,13 @@ class Prefix:
         for name in self.shared:
             if name.startswith(prefix):
                 raise ValueError(f"the shared name {name!r} starts with the prefix {prefix!r}")
+        if prefix[-1].isalnum():
+            logging.getLogger("tfbus").warning(
+                "the prefix %r makes the frame %r of 'base_link': the slash is part of a prefix, as in %r",
+                prefix,
+                f"{prefix}base_link",
+                f"{prefix}/",
+            )
 
     def on_bus(self, name: str) -> str:
         """The name on the bus for a local name. An invalid name is returned unchanged, and the bus refuses it."""

@@ -4,7 +4,7 @@ import logging
 import os
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any
+from typing import Any, NoReturn
 from weakref import finalize
 
 
@@ -35,6 +35,17 @@ class Registration:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+
+class AsyncOnly:
+    """A base of classes that own a task or a socket: a plain ``with`` raises a `TypeError` that says ``async with``."""
+
+    def _refuse_with(self, *_: object) -> NoReturn:
+        name = type(self).__name__
+        raise TypeError(f"a {name} owns a task or a socket: write `async with {name}(...)`, not `with`")
+
+    # Type checkers should not take it for something that has a `with`.
+    vars().update(__enter__=_refuse_with, __exit__=_refuse_with)
 
 
 def warn_unless_entered(thing: object) -> "finalize[..., Any]":

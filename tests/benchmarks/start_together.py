@@ -79,7 +79,7 @@ def measure(processes: int, place: Place, seconds: float = 0.0) -> list[Facts]:
         paths = os.pathsep.join(sys.path)
         compiled = os.environ | {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": folder, "PYTHONPATH": paths}
         modules = ["start_together", *["tfbus.links.zenoh"] * (place.carrier == "router")]
-        imports = [sys.executable, "-c", f"import {', '.join(modules)}"]
+        imports = [sys.executable, "-P", "-c", f"import {', '.join(modules)}"]
         subprocess.run(imports, env=compiled, cwd=Path(__file__).parent, check=True)
         try:
             for number in range(processes):

@@ -111,7 +111,7 @@ def session(**addresses: str) -> zenoh.Session:
 
 def command(program: str, *arguments: Any) -> list[str]:
     paths = f"import sys; sys.path[:0] = {sys.path!r}\n"
-    return [sys.executable, "-c", f"{paths}{HEADER}{program}\nanyio.run(main, *{arguments!r})"]
+    return [sys.executable, "-P", "-c", f"{paths}{HEADER}{program}\nanyio.run(main, *{arguments!r})"]
 
 
 @contextmanager

@@ -91,7 +91,7 @@ def processes() -> Iterator[Crowd]:
 
 
 def program(text: str, *arguments: Any) -> list[str]:
-    return [sys.executable, "-c", text, json.dumps(arguments)]
+    return [sys.executable, "-P", "-c", text, json.dumps(arguments)]
 
 
 def pair(processes: Crowd, place: Place, backend: str) -> tuple[PeerProcess, PeerProcess]:

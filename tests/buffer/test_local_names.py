@@ -13,7 +13,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from support.asking import Asked, driving, settle
 from support.samples import any_samples, static, x_of
-from support.strategies import frame_names
 
 from tfbus import (
     LATEST,
@@ -32,7 +31,7 @@ from tfbus import (
     TransformLookupError,
     UnknownFrameError,
 )
-from tfbus.frames import Prefix, check_frame, is_frame
+from tfbus.frames import Prefix
 
 pytestmark = pytest.mark.anyio
 
@@ -244,36 +243,6 @@ def test_an_explanation_has_local_names_and_its_errors_have_bus_names() -> None:
 
 
 names = st.text("ab/_", min_size=1, max_size=6).filter(lambda name: not name.startswith("/"))
-
-
-@given(frame_names())
-def test_any_text_without_a_leading_slash_is_a_frame_name(name: str) -> None:
-    assert is_frame(name)
-    check_frame(name)
-
-
-@pytest.mark.parametrize(
-    ("bad", "text"),
-    [
-        ("", "a frame name must not be empty"),
-        ("/map", "a frame name must not start with '/', got '/map': write 'map'"),
-        ("//a/b", "a frame name must not start with '/', got '//a/b': write 'a/b'"),
-        ("/", "a frame name must not start with '/', got '/'"),
-    ],
-)
-def test_a_bad_frame_name_is_refused_with_the_facts(bad: str, text: str) -> None:
-    assert not is_frame(bad)
-    with pytest.raises(InvalidTransformError) as caught:
-        check_frame(bad, "map", "base_link", "odometry")
-    error = caught.value
-    assert (str(error), error.reason) == (text, "frame name")
-    assert (error.parent, error.child, error.authority) == ("map", "base_link", "odometry")
-
-
-@pytest.mark.parametrize("bad", [None, 5, b"map"])
-def test_a_frame_name_that_is_no_str_is_a_type_error_that_shows_it(bad: Any) -> None:
-    with pytest.raises(TypeError, match=f"a frame name must be a str, not {bad!r}"):
-        is_frame(bad)
 
 
 # Prefixes

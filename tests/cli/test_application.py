@@ -238,7 +238,7 @@ def test_letters_that_the_output_cannot_encode_are_escaped(tmp_path: Path) -> No
 def test_a_missing_extra_is_named(package: str, arguments: str, status: int, message: str, tmp_path: Path) -> None:
     hidden = f"import sys; sys.modules[{package!r}] = None; from tfbus.cli import main; main()"
     words = arguments.replace("DOMAIN", new_domain()).split()
-    done = run_process(sys.executable, "-c", hidden, *words, cwd=tmp_path)
+    done = run_process(sys.executable, "-P", "-c", hidden, *words, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (status, "", f"tfbus: {message}\n")
 
 
@@ -247,13 +247,13 @@ def test_two_terminals_need_no_zenoh() -> None:
     hidden = "import sys; sys.modules['zenoh'] = None; from tfbus.cli import main; main()"
     words = ("--domain", new_domain())
     with (
-        Program(sys.executable, "-c", hidden, "broadcast", *words) as broadcast,
-        Program(sys.executable, "-c", hidden, "listen", *words) as listen,
-        Program(sys.executable, "-c", hidden, "echo", "base_link", "base_laser", *words) as echo,
+        Program(sys.executable, "-P", "-c", hidden, "broadcast", *words) as broadcast,
+        Program(sys.executable, "-P", "-c", hidden, "listen", *words) as listen,
+        Program(sys.executable, "-P", "-c", hidden, "echo", "base_link", "base_laser", *words) as echo,
     ):
         assert listen.output.expect("base_laser: ").startswith("[ INFO]")
         assert echo.output.expect("Translation") == "- Translation: [0.100000, 0.000000, 0.200000] m"
-        with Program(sys.executable, "-c", hidden, "tree", *words) as tree:
+        with Program(sys.executable, "-P", "-c", hidden, "tree", *words) as tree:
             assert tree.wait() == 0
         assert tree.errors.text == "hears 3 peers on this machine\n"
         for program in (broadcast, listen, echo):
@@ -267,7 +267,7 @@ def test_the_help_of_all_and_the_version_load_no_optional_package_and_no_numpy(o
         f"import sys, tfbus.cli as cli; cli.run(['{option}']); "
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))"
     )
-    loaded = run_process(sys.executable, "-c", script).stdout.splitlines()[-1].split()
+    loaded = run_process(sys.executable, "-P", "-c", script).stdout.splitlines()[-1].split()
     assert "tfbus" in loaded
     assert set(loaded) & {"cyclopts", "rich", "zenoh", "trio", "mcap", "rosbags", "lxml", "anyio", "numpy"} == set()
 
@@ -288,7 +288,6 @@ def test_a_signal_ends_it_silently_whenever_it_comes(number: signal.Signals) -> 
     assert statuses <= {-number, 128 + number}
 
 
-@pytest.mark.thorough
 def test_where_ctrl_c_is_ignored_a_termination_ends_it() -> None:
     script = 'trap "" INT; exec "$0" tree --domain "$1"'
     with Program("sh", "-c", script, TFBUS, new_domain()) as tree:

@@ -61,21 +61,6 @@ def test_a_program_asks_the_buffer_of_a_robot_and_of_one_robot_only() -> None:
         LinkOptions(domain, robots=("r1", "r2")).run_remote(serve_and_ask)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_two_programs_of_a_domain_hear_each_other_and_return_their_results(backend: str) -> None:
-    options = LinkOptions(new_domain(), backend=backend)  # type: ignore[arg-type]
-
-    async def meet(bus: Bus) -> str:
-        arrived = anyio.Event()
-        with Bus() as other, bus.subscribe(lambda _: arrived.set()):
-            async with options.join(other):
-                other.publish(static("map", "odom"))
-                await arrived.wait()
-        return "met"
-
-    assert options.run(meet) == "met"
-
-
 NO_ADDRESSES = (
     "7447 127.0.0.1:7447 foo/127.0.0.1:7447 tcp tcp/ tcp/:7447 tcp/127.0.0.1 tcp/::1:7447 tcp/127.0.0.1: "
     "tcp/127.0.0.1:x tcp/127.0.0.1:65536 tcp//127.0.0.1:7447"
@@ -237,23 +222,6 @@ def test_ctrl_c_is_raised_even_if_the_function_ends_by_itself_and_an_error_witho
     for main in (fail, fail_in_the_cleanup):
         with pytest.raises(OSError, match="no"):
             run(main, backend)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_ctrl_c_stays_ignored_where_it_was_ignored(backend: str) -> None:
-    done = []
-
-    async def main() -> None:
-        press_ctrl_c()
-        await anyio.sleep(0.01)
-        done.append(backend)
-
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        run(main, backend)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert done == [backend]
 
 
 THEN = 1_400_000_000 * SECOND

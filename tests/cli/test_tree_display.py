@@ -34,15 +34,6 @@ def test_columns_are_aligned_whatever_the_width_of_the_letters() -> None:
     assert (wide.plain, narrow.plain) == ("├── 雷达  static", "└── odom  static")
 
 
-def test_where_the_output_is_no_terminal_a_live_tree_is_printed_again_below_a_blank_line(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with TreeDisplay(live=True) as display:
-        display.show([STATIC], 0)
-        display.show([STATIC], 0)
-    assert capsys.readouterr().out == 2 * "base_link\n└── lidar  static\n\n"
-
-
 @pytest.mark.parametrize("environment", [{}, {"NO_COLOR": "1"}])
 def test_on_a_terminal_a_live_tree_is_redrawn_in_place_with_the_cursor_shown_and_in_colour_unless_forbidden(
     monkeypatch: pytest.MonkeyPatch, environment: dict[str, str]

@@ -30,6 +30,12 @@ NEEDS = {"plot": "matplotlib", "view": "viser", "foxglove": "foxglove", "robot":
         ("broadcast --listen rubbish", "an address is like tcp/192.168.1.5:7447, not 'rubbish'"),
         ("router --listen 7447", "an address is like tcp/"),
         ("static map odom --domain 'a b'", "a domain is made of letters"),
+        # The commands of tf2
+        ("view_frames", "tf2's view_frames is `tfbus tree`"),
+        ("tf2_echo map base", "`tfbus echo TARGET SOURCE`"),
+        ("static_transform_publisher 0 0 0 0 0 0 a b", "`tfbus static PARENT CHILD"),
+        ("echo map base_link 10", "tf2_echo's rate is an option: type tfbus echo map base_link --rate 10"),
+        ("echo map base_link arm", "expected TARGET and SOURCE, not 'arm' as well"),
         # Frames, and places to join
         ("echo map", "SOURCE"),
         ("monitor map", "'map' has no SOURCE"),
@@ -65,6 +71,7 @@ NEEDS = {"plot": "matplotlib", "view": "viser", "foxglove": "foxglove", "robot":
         ("query run.mcap map base --topic /a --namespaces", "give one of them"),
         ("query run.mcap map base --stamps-of /nothing", "nothing is on topic"),
         ("query run.mcap map base --at 1 --every 1", "give one of them"),
+        ("query run.mcap map base --at yesterday", "or a date such as 2014-03-31T19:24:50, not 'yesterday'"),
         ("query run.mcap map base --every 0", "more than 0 s"),
         ("query run.mcap map base --every 0.000000001", "there would be 10,000,000,001 lines"),
         ("compare run.mcap run.mcap --pair base", "a pair is TARGET:SOURCE"),

@@ -40,8 +40,9 @@ def test_a_sample_gives_back_what_it_was_made_of() -> None:
 @pytest.mark.parametrize(
     ("parent", "child", "stamp", "reason", "text"),
     [
-        ("/lidar", "base_link", 0, "frame name", "write 'lidar'"),
-        ("map", "/lidar", 0, "frame name", "write 'lidar'"),
+        ("", "base_link", 0, "frame name", "a frame name must not be empty"),
+        ("//a/b", "base_link", 0, "frame name", "must not start with '/', got '//a/b': write 'a/b'"),
+        ("map", "/", 0, "frame name", "must not start with '/', got '/'$"),
         ("map", "map", 0, "self transform", "frame 'map' cannot be its own parent"),
         ("map", "base_link", STAMP_MIN - 1, "stamp", "64-bit"),
         ("map", "base_link", STAMP_MAX + 1, "stamp", "64-bit"),

@@ -39,7 +39,7 @@ def in_a_process(body):
 
 
 def said(program: str) -> list[str]:
-    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", BEGIN + program]
+    command = [sys.executable, "-P", "-W", "ignore::DeprecationWarning", "-c", BEGIN + program]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert done.stderr == ""
     return done.stdout.splitlines()
@@ -195,7 +195,7 @@ kept = [ZenohLink(Bus(), connect="tcp/127.0.0.1:1"), RosbridgeLink(Bus(), "ws://
 kept += [BufferServer(Buffer(link.bus), link), ZenohRouter("tcp/127.0.0.1:1")]
 in_a_child(lambda: sys.exit())
 """
-    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", program]
+    command = [sys.executable, "-P", "-W", "ignore::DeprecationWarning", "-c", program]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     assert [line.split()[0] for line in done.stdout.splitlines()] == ["OSError", "ValueError"]
     assert sorted(done.stderr.splitlines()) == [

@@ -38,7 +38,7 @@ BOUNDS = [
         ("links.zenoh.sessions", "UNSENT"),
         ("links.zenoh.wire", "MAX_LINKS MAX_CHANNELS"),
         ("links.zenoh.sessions", "OPENING_TIME"),
-        ("links.link", "_LONGEST_NAME"),
+        ("links.domain", "_LONGEST_NAME"),
         ("links.message", "MAX_LOOKUP MAX_DEPTH"),
         ("links.lookups", "LONGEST_WAIT PATIENCE"),
         ("links.ros.ros_link", "MAX_SIZE MAX_OTHER_SIZE AT_ONCE PART MOST_TRANSFORMS"),

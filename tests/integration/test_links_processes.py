@@ -238,7 +238,7 @@ def program_beside(processes: Crowd, place: Place, text: str, **names: str) -> I
     for name, value in (names | {"DOMAIN": place.domain, "ADDRESS": address}).items():
         text = text.replace(name, repr(value))
     with subprocess.Popen(
-        [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-P", "-c", text], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         try:
             yield process

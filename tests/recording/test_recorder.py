@@ -392,7 +392,7 @@ anyio.run(main, backend=sys.argv[2])
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 @pytest.mark.parametrize("lines", [1, 3])
 def test_all_samples_but_the_last_ones_can_be_read_after_sigkill(path: Path, backend: str, lines: int) -> None:
-    command = [sys.executable, "-c", KILLED, str(path), backend]
+    command = [sys.executable, "-P", "-c", KILLED, str(path), backend]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         written = [int(process.stdout.readline()) for _ in range(lines)]

@@ -270,7 +270,7 @@ def test_without_a_package_the_error_names_the_extra_and_other_formats_are_read(
         "except RecordingError as error:\n"
         "    print(error.reason, error)\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("missing extra ")
     assert 'pip install "tfbus[bag]"' in done.stdout
 

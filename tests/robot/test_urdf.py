@@ -251,7 +251,7 @@ def test_reading_does_not_depend_on_asserts() -> None:
         "    except tfbus.InvalidRobotError as error: print(error.element)"
     )
     done = subprocess.run(
-        [sys.executable, "-O", "-c", script], capture_output=True, text=True, check=True, env=os.environ
+        [sys.executable, "-P", "-O", "-c", script], capture_output=True, text=True, check=True, env=os.environ
     )
     assert done.stdout == '<joint name="j">\n' * 2
 

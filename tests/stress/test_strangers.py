@@ -265,7 +265,7 @@ class LocalStranger:
     async def meet(self) -> bytes:
         """Meet the attacked link; returns what that says first."""
         # The first name is that of the oldest link, which the test attacks.
-        self._peer = await RawPeer.connect(files_in(self._directory)[0], self._domain)
+        self._peer = await RawPeer.connect(files_in(self._directory)[0])
         await self._peer.meet()
         return await self._peer.hear()
 
@@ -363,7 +363,7 @@ async def attacked(stranger: Stranger, **options: Any) -> AsyncIterator[tuple[Do
                 await stranger.leave()
                 await until(lambda: len(link.peers) == 1)
                 other.publish(static("map", "chair"))
-                bus.publish(static("map", "table"))
+                bus.publish([static("map", "table"), static("map", "lamp")])
                 await until(lambda: statics(bus).get("chair") == statics(other).get("table") == "map")
                 other.publish(static("room", "chair"))
                 bus.remove_frame("table")

@@ -280,7 +280,7 @@ class OneMachine(World):
         super().check()
         # All names are shown again, and those of the dead are gone. A socket is no name on the loopback.
         until = time.monotonic() + LIMIT
-        while (names := len(list(self._directory.glob("*/[0-9a-f]*"))) - len(self.members)) != 0:
+        while (names := len(list(self._directory.glob("[0-9a-f]*-*"))) - len(self.members)) != 0:
             if self._loopback and names > 0:
                 break
             assert time.monotonic() < until, f"{names} names too many after {self.story[-3:]}"
@@ -291,9 +291,9 @@ class OneMachine(World):
 
     def fault_stale_names(self, member: Member, other: Member) -> None:
         """Leave names behind at which nobody listens, or nobody answers, or which are something else."""
-        (folder,) = self._directory.iterdir()
+        (domain, *_) = {path.name.partition("-")[0] for path in self._directory.iterdir()}
         for kind in ("deaf", "dead", "text", "folder"):
-            path = folder / f"{self.rng.randrange(16**12):016x}{self.rng.randrange(16**8):08x}"
+            path = self._directory / f"{domain}-{self.rng.randrange(16**12):016x}{self.rng.randrange(16**8):08x}"
             if kind in ("deaf", "dead"):
                 listener = socket.socket(socket.AF_UNIX)
                 listener.bind(str(path))
@@ -410,7 +410,7 @@ class Router:
 
     def start(self) -> None:
         prefix = () if self.host is None else self.host.prefix
-        self.program = Program(*prefix, sys.executable, "-c", _ROUTER, self.address, *self.others)
+        self.program = Program(*prefix, sys.executable, "-P", "-c", _ROUTER, self.address, *self.others)
         self.program.output.expect("ready")
 
     def signal(self, number: signal.Signals) -> None:

@@ -107,6 +107,6 @@ anyio.run(main, *sys.argv[1:])
 
 def start_router(listen: str, *connect: str) -> Program:
     """A router in a process of its own, with a lease of 1 s; use it as a context."""
-    program = Program(sys.executable, "-c", _ROUTER, listen, *connect)
+    program = Program(sys.executable, "-P", "-c", _ROUTER, listen, *connect)
     program.output.expect("ready")
     return program

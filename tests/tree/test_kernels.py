@@ -6,13 +6,16 @@ import math
 import os
 import pickle
 import random
+import shutil
 import struct
 import subprocess
 import sys
 import threading
 import weakref
 from contextlib import suppress
+from importlib.machinery import EXTENSION_SUFFIXES
 from itertools import pairwise
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -25,6 +28,7 @@ from support.samples import row_of
 from support.strategies import TODAY, transforms
 from transforms3d.quaternions import quat2mat
 
+import tfbus
 from tfbus import LATEST, SECOND, Hold, Transform, TransformStamped, TransformTree, _python_kernel
 from tfbus.rows import IDENTITY, Row, compose, interpolate, invert
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
@@ -658,6 +662,22 @@ def test_the_compiled_kernel_runs_where_it_was_built(wanted: str | None) -> None
 
 def test_the_twin_runs_where_the_compiled_kernel_is_missing() -> None:
     assert run(None, WITHOUT + SHOW).stdout.split() == ["python", "tfbus._python_kernel"]
+
+
+@pytest.mark.parametrize("wanted", [None, "python"])
+def test_a_checkout_that_hides_an_installed_compiled_kernel_warns_once_unless_it_is_asked_for(
+    wanted: str | None, tmp_path: Path
+) -> None:
+    package, installed = Path(tfbus.__file__).parent, tmp_path / "site-packages" / "tfbus"
+    shutil.copytree(package, tmp_path / "tfbus", ignore=shutil.ignore_patterns("_kernel.*", "__pycache__"))
+    installed.mkdir(parents=True)
+    (installed / f"_kernel{EXTENSION_SUFFIXES[-1]}").touch()
+    folders = f"import sys; sys.path[:0] = {[str(tmp_path), str(installed.parent)]}\n"
+    done = run(wanted, folders + SHOW + "from tfbus import Transform, kernel\nprint(Transform.__module__)")
+    assert done.stdout.split() == ["python", "tfbus._python_kernel", "tfbus.geometry.transform"]
+    told = f"RuntimeWarning: tfbus is loaded from {tmp_path / 'tfbus'}, which has no compiled kernel, and not from "
+    assert done.stderr.count(f"{told}{installed}, which has one") == (wanted is None)
+    assert bool(done.stderr) == (wanted is None)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """The buffer: a tree that a bus fills, and lookups that wait for missing transforms."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, SupportsIndex, TypeVar
 
@@ -8,16 +10,18 @@ from tfbus._aio.loops import checkpoint, on_asyncio
 from tfbus.buffer.lookups import LocalNames, Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
-from tfbus.data import Stamped, do_transform
-from tfbus.errors import ExtrapolationError, TransformLookupError
+from tfbus.data import PointCloud, Stamped, do_transform
+from tfbus.errors import LookupTimeoutError, TransformLookupError
 from tfbus.frames import as_prefix, is_frame
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.registration import Registration
 from tfbus.stamps import LATEST, AtLike, as_at, as_duration
+from tfbus.tf2_names import says_ours
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
 from tfbus.tree.lookup import Hold, Question, answer, policy_of, question_of
+from tfbus.tree.lookup_many import deskew, deskew_stamps
 from tfbus.tree.rendering import counted, describe, legend, to_html
 from tfbus.tree.tree import TransformTree, forest_of, tree_of, window_of
 from tfbus.waiting.live_tree import LiveTree, PendingLookup
@@ -29,6 +33,7 @@ _DESCRIBED = 10
 """The number of waiting lookups that `describe` shows; each may have to search all frames for similar names."""
 
 
+@says_ours
 class Buffer:
     """A few seconds of every frame on a bus, and the transforms between them.
 
@@ -183,8 +188,8 @@ class Buffer:
             found = answer(self._forest, above, below, at, source_at, via, bounds, policy)
             # The next such lookup is as plain as one without a prefix.
             self._forest.keep_locally(self._paths, (target, source), above, below)
-        except ExtrapolationError as error:
-            self._lookups.note_ahead(error)
+        except TransformLookupError as error:
+            self._lookups.complete(error, max_age, bounds)
             raise
         # Not `names.answer`, which costs a fifth of this lookup: the local names are at hand.
         return renamed(found, target, source)
@@ -337,6 +342,75 @@ class Buffer:
             await checkpoint()
             return data
         return do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
+
+    async def deskew(
+        self,
+        cloud: PointCloud,
+        target: str,
+        *,
+        fixed: str,
+        timeout: float | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> PointCloud:
+        """A cloud from a moving sensor as if all points had been seen at its stamp, as soon as that is known.
+
+        It waits for the transforms of the newest point and of the stamp of the cloud. If the oldest point has no
+        transform any more, it fails at once. `TransformTree.deskew` does the rest, and can leave such points out:
+        ``buffer.tree.deskew(cloud, target, fixed, out_of_range="nan")``.
+
+        Parameters
+        ----------
+        cloud : PointCloud
+            With a stamp for each point; `LaserScan.to_points` gives such a cloud.
+        target : str
+            The frame of the result; often the frame of the cloud.
+        fixed : str
+            The frame that stands still meanwhile, such as ``"odom"``.
+        timeout : float, optional
+            In s on the bus's clock, for everything together; None waits for ever.
+        tolerance, max_gap, extrapolate
+            As `lookup`, for each point.
+
+        Returns
+        -------
+        PointCloud
+            In `target`, without stamps for the points, of the same float type and with the same fields.
+
+        Raises
+        ------
+        TransformError
+            As `lookup`; `index` says which point has no answer.
+        ValueError
+            If the points have no stamps.
+        TypeError
+            If `cloud` is no `PointCloud`.
+
+        Examples
+        --------
+        >>> async def straighten(buffer: Buffer, scan: LaserScan) -> PointCloud:
+        ...     return await buffer.deskew(scan.to_points(), "base_link", fixed="odom", timeout=0.2)
+        """
+        at, stamps = deskew_stamps(cloud)
+        policy = policy_of(tolerance, max_gap, extrapolate)
+        ends = (int(stamps.max()), int(stamps.min())) if len(stamps) else ()
+        questions = [Question(fixed, cloud.frame, end, policy=policy) for end in ends]
+        questions.append(Question(target, fixed, at, policy=policy))
+        patience = math.inf if timeout is None else as_duration(timeout, "timeout")
+        with self._clock.move_on_after(patience) as all_of_them:
+            await self._lookup_among(questions)
+        for question in questions if all_of_them.cancelled_caught else ():
+            try:
+                await self._lookups.lookup(self._on_bus(question), 0.0)
+            except LookupTimeoutError as error:
+                error.timeout = patience
+                raise
+        if self._local_names is None:
+            return deskew(self._forest, cloud, target, fixed, "raise", policy)
+        above, below, still = map(self._local_names.on_bus, (target, cloud.frame, fixed))
+        found = deskew(self._forest, replace(cloud, frame=below), above, still, "raise", policy)
+        return replace(found, frame=target)
 
     def transform_nowait(
         self,
@@ -499,8 +573,7 @@ class Buffer:
             now=self._clock.now(),
         )
         for error in found.errors:
-            if isinstance(error, ExtrapolationError):
-                self._lookups.note_ahead(error)
+            self._lookups.complete(error, max_age, bounds)
         return found if self._local_names is None else self._local_names.explanation(found, target, source)
 
     def pending(self) -> tuple[PendingLookup, ...]:

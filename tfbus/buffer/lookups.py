@@ -258,6 +258,9 @@ REPORT_AFTER = 5.0
 NAMED = 3
 """The number of lookups that a line names; naming one searches all frames for similar names."""
 
+_NO_TIMEOUT = 1e7
+"""A timeout of this many s, a third of a year, is never meant; but 10 ms in nanoseconds is this number."""
+
 _LOOKED_AT = 10_000
 _LEAST_PAUSE = 0.1
 
@@ -294,6 +297,7 @@ class HangingReport:
         named: list[PendingLookup] = []
         unnamed = 0
         first = math.inf
+        doubt = ""
         for waiter in self._share.waiters[:_LOOKED_AT]:
             pause = REPORT_AFTER - to_seconds(now - waiter.since)
             if waiter.patience <= REPORT_AFTER or waiter.cause in self._told:
@@ -304,6 +308,8 @@ class HangingReport:
                 unnamed += self._told.add(waiter.cause)
             elif (blocker := self._blocker(waiter)) is not None:
                 self._told.add(waiter.cause)
+                if _NO_TIMEOUT <= waiter.patience < math.inf:
+                    doubt = f"; a timeout of {waiter.patience:,.0f} s, nanoseconds passed as seconds?"
                 named.append(PendingLookup(waiter.question, waiter.since, blocker))
         if not named:
             return max(first, _LEAST_PAUSE)
@@ -312,14 +318,15 @@ class HangingReport:
         if len(named) == 1:
             question = named[0].question
             log.warning(
-                "a lookup of %r in %r has waited for more than %g s: %s",
+                "a lookup of %r in %r has waited for more than %g s: %s%s",
                 question.source,
                 question.target,
                 REPORT_AFTER,
                 named[0].blocked_by,
+                doubt,
             )
         else:
-            lookups = "; ".join(map(str, named))
+            lookups = "; ".join(map(str, named)) + doubt
             more = f"; and {unnamed} more, see Buffer.pending()" if unnamed else ""
             log.warning(
                 "%d lookups have waited for more than %g s: %s%s", len(named) + unnamed, REPORT_AFTER, lookups, more
@@ -398,8 +405,14 @@ class Lookups:
         now, age = self._clock.now(), from_seconds(max_age)
         return Bounds(max(now - age, STAMP_MIN), min(now + age, STAMP_MAX))
 
-    def note_ahead(self, error: ExtrapolationError) -> None:
-        """Write into an error by how much the newest stamp of its edge is ahead of the clock."""
+    def complete(self, error: TransformLookupError, max_age: float | None, bounds: Bounds | None) -> None:
+        """Write into an error of the tree what only the bus and its clock know."""
+        if isinstance(error, UnknownFrameError):
+            error.missed = self.share.end_reason is None and self.bus._knows(error.frame)
+        if not isinstance(error, ExtrapolationError):
+            return
+        if max_age is not None and bounds is not None and error.newest is not None and error.stamp in bounds:
+            error.max_age = from_seconds(max_age)
         # The clock alone nearly always tells that it is not; how far ahead a stamp may be is asked only then.
         if error.newest is not None and self._clock.now() < error.newest > self.bus._newest_plausible():
             error.ahead = error.newest - self._clock.now()
@@ -424,8 +437,8 @@ class Lookups:
                 bounds,
                 question.policy,
             )
-        except ExtrapolationError as error:
-            self.note_ahead(error)
+        except TransformLookupError as error:
+            self.complete(error, question.max_age, bounds)
             raise
         return found if self._local_names is None else self._local_names.answer(found)
 
@@ -524,7 +537,7 @@ class Lookups:
         """The answer; or None, after parking the lookup under the frames that block it, with a new wake-up."""
         found = self._look(wait, last_reset)
         if found is None and wait.blocked_by is not None:
-            self.bus._check_thread()
+            self.bus._check_waiter()
             if self.share.end_reason is not None:
                 raise BusClosedError(self.share.end_reason) from wait.blocked_by
             wait.sleep = self._fall_asleep(wait)

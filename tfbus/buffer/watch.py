@@ -54,7 +54,7 @@ class Watch:
         self._watching = live.watching
         self._lookups = lookups
         self._clock = lookups.bus.clock
-        self._check_thread = lookups.bus._check_thread
+        self._check_thread = lookups.bus._check_waiter
         self._reader = OneReader()
         self._last: TransformStamped | None = None
         self._last_given_at: int | None = None

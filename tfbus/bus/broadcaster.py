@@ -13,8 +13,10 @@ from tfbus.geometry.columns import Names
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
 from tfbus.stamps import StampLike, StampsLike
+from tfbus.tf2_names import says_ours
 
 
+@says_ours
 class TransformBroadcaster:
     """Publishes samples that carry its authority.
 

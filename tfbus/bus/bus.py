@@ -34,9 +34,16 @@ from tfbus.geometry.stamped import MAX_TRANSLATION, Batch, TransformStamped, as_
 from tfbus.registration import Registration
 from tfbus.stamps import StampLike, StampsLike, format_stamp
 from tfbus.statistics import BufferStatistics, BusStatistics
+from tfbus.tf2_names import says_ours
 from tfbus.tree.forest import Forest, LoopingSample
 from tfbus.waiting.live_tree import LiveTree, Share
 from tfbus.which_kernel import Intake
+
+_PUBLISH_INSTEAD = "publish with `with bus.threadsafe() as publish`"
+_WAIT_INSTEAD = (
+    "ask here with `lookup_nowait`, or wait on the loop of the bus, by `anyio.from_thread.run` or "
+    "`asyncio.run_coroutine_threadsafe`"
+)
 
 
 class OwnerThread:
@@ -74,8 +81,11 @@ class OwnerThread:
         """Whether this thread owns the bus, and has run an event loop with it."""
         return get_ident() == self.thread and self._on_a_loop
 
-    def check(self) -> None:
-        """Raise `RuntimeError` unless this thread owns the bus, or runs an event loop and may take it over."""
+    def check(self, instead: str = _PUBLISH_INSTEAD) -> None:
+        """Raise `RuntimeError` unless this thread owns the bus, or runs an event loop and may take it over.
+
+        `instead` ends the message: what this thread may do.
+        """
         if self.is_here():
             return
         self.check_process()
@@ -83,7 +93,7 @@ class OwnerThread:
         on_a_loop = _runs_a_loop()
         if thread != self.thread:
             if self._on_a_loop or not on_a_loop:
-                raise RuntimeError("the bus belongs to another thread: publish with `with bus.threadsafe() as publish`")
+                raise RuntimeError(f"the bus belongs to another thread: {instead}")
             self._set(thread)
         self._on_a_loop = on_a_loop
 
@@ -130,6 +140,7 @@ def _runs_a_loop() -> bool:
     return False
 
 
+@says_ours
 class Bus:
     """Broadcasts stamped transforms inside one process.
 
@@ -367,6 +378,10 @@ class Bus:
         """
         self._owner.check()
 
+    def _check_waiter(self) -> None:
+        """As `_check_thread`, for a task that is about to wait. Called by lookups and watches."""
+        self._owner.check(_WAIT_INSTEAD)
+
     def subscribe(self, callback: BatchCallback, removed: FrameCallback | None = None) -> Registration:
         """Call `callback` with each batch, a tuple of samples, until the registration is closed.
 
@@ -552,8 +567,7 @@ class Bus:
             If neither the bus nor a buffer knows the frame.
         """
         self._check_usable()
-        on_bus = frame in self._topology or frame in self._topology.names
-        if not on_bus and not any(frame in live.forest.names for live in self._trees):
+        if not self._knows(frame) and not any(frame in live.forest.names for live in self._trees):
             raise UnknownFrameError(frame=frame, known=self._topology.names.some())
         self._removals += 1
         self._topology.remove(frame)
@@ -681,6 +695,10 @@ class Bus:
     def _remove_if_known(self, frame: str) -> None:
         with suppress(UnknownFrameError):
             self.remove_frame(frame)
+
+    def _knows(self, frame: str) -> bool:
+        """Whether the bus has had a sample that names a frame, and has not removed it. Called by buffers."""
+        return frame in self._topology or frame in self._topology.names
 
     def _newest_plausible(self) -> int:
         """The greatest stamp, in ns, that is not ahead of the clock now. Called by buffers."""

@@ -8,7 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Final, Literal, get_args
 
+from tfbus.cli.statuses import USAGE_ERROR
 from tfbus.cli.version import version
+from tfbus.tf2_names import ours
 
 COMMANDS = {
     "bridge": "Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.",
@@ -64,7 +66,11 @@ def parser_of(words: Sequence[str]) -> Callable[[], _Program | None]:
         return _print_overview
     # `info` is a level of the log, too.
     named = (word for before, word in zip(("", *words), words, strict=False) if before != "--log-level")
-    app = application(next((word for word in named if word in COMMANDS), None))
+    plain = [word for word in named if not word.startswith("-")]
+    command = next((word for word in plain if word in COMMANDS), None)
+    if command is None and plain and (hint := ours("command", plain[0])):
+        return lambda: partial(_refuse, plain[0], hint)
+    app = application(command)
 
     def parse() -> _Program | None:
         prepare, arguments, _ = app.meta.parse_args(words, exit_on_error=False, print_error=False)
@@ -72,6 +78,11 @@ def parser_of(words: Sequence[str]) -> Callable[[], _Program | None]:
         return program
 
     return parse
+
+
+def _refuse(command: str, hint: str) -> int:
+    print(f"tfbus: there is no command {command!r}: {hint}", file=sys.stderr)
+    return USAGE_ERROR
 
 
 def _print_overview() -> None:

@@ -23,6 +23,18 @@ class UsageError(Exception):
     """An argument cannot be used: the command prints the message in one line and exits with status 2."""
 
 
+_INSTANT = "expected seconds, or a date such as 2014-03-31T19:24:50, not {!r}"
+
+
+def is_number(word: str) -> bool:
+    """Whether a word that was typed is a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 class Seconds(int):
     """Nanoseconds that are typed in seconds; the help shows the name of this class."""
 
@@ -74,6 +86,8 @@ def parse_time(text: str) -> Time:
     """
     if _DATE.match(text.strip()):
         return Time(_parse_date(text.strip()), absolute=True)
+    if not is_number(text):
+        raise ValueError(_INSTANT.format(text))
     nanoseconds = parse_seconds(text)
     if nanoseconds < 0:
         raise ValueError(f"expected a time from the beginning on, not {text}")
@@ -87,7 +101,7 @@ def _parse_date(text: str) -> int:
         date = datetime.fromisoformat(head + (zone or ""))
         seconds = calendar.timegm((date if date.tzinfo else date.replace(tzinfo=UTC)).utctimetuple())
     except (ValueError, OverflowError):
-        raise ValueError(f"expected seconds, or a date such as 2014-03-31T19:24:50, not {text!r}") from None
+        raise ValueError(_INSTANT.format(text)) from None
     return parse_seconds(f"{seconds}{digits or ''}" if seconds >= 0 else str(seconds))
 
 

@@ -1,7 +1,7 @@
 """`do_transform`, which transforms data of any registered type into another frame."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from functools import singledispatch, wraps
 from itertools import repeat
@@ -109,18 +109,43 @@ def _dispatched(function: Callable[[Any, TransformStamped], Any]) -> DoTransform
 
     @wraps(generic)
     def dispatch(data: Any, transform: TransformStamped) -> Any:
-        # Its own search takes longer than to move a point, even for a type that is registered itself.
-        return (registered(type(data)) or generic)(data, transform)
+        try:
+            # Its own search takes longer than to move a point, even for a type that is registered itself.
+            return (registered(type(data)) or generic)(data, transform)
+        except (AttributeError, TypeError):
+            check_transform(data, transform)
+            raise
 
     return cast(DoTransform, dispatch)
+
+
+def is_message(thing: object) -> bool:
+    """Whether something looks like a stamped message of ROS, an object or a mapping."""
+    return "header" in thing if isinstance(thing, Mapping) else hasattr(thing, "header")
 
 
 def check_registered(data: object) -> None:
     """Raise `TypeError` unless `do_transform` knows the type of `data`; the message says how to register it."""
     if do_transform.dispatch(type(data)) is do_transform.dispatch(object):
         kind = type(data).__name__
+        if is_message(data):
+            raise TypeError(f"cannot transform a {kind}: convert a ROS message with from_message first")
         instead = "transform its to_points() instead, or " if hasattr(data, "to_points") else ""
         raise TypeError(f"cannot transform a {kind}: {instead}register a function with @do_transform.register({kind})")
+
+
+def check_transform(data: object, transform: object) -> None:
+    """Raise `TypeError` unless `transform` is a `TransformStamped`; the message says what the arguments look like."""
+    if isinstance(transform, TransformStamped):
+        return
+    if isinstance(data, TransformStamped):
+        raise TypeError("do_transform takes the data first: do_transform(data, transform)") from None
+    if isinstance(transform, Transform):
+        raise TypeError(
+            "a Transform has no frames and no stamp: give do_transform a TransformStamped, as a lookup does, or move "
+            "bare points by transform.apply(points)"
+        ) from None
+    raise TypeError(f"do_transform takes a TransformStamped, not {transform!r}") from None
 
 
 @_dispatched
@@ -142,7 +167,8 @@ def do_transform(data: Any, transform: TransformStamped) -> Any:  # noqa: ARG001
     Raises
     ------
     TypeError
-        If the type is not registered. The message says how to register it.
+        If the type is not registered, whose message says how to register it, or `transform` is not a
+        `TransformStamped`.
     ValueError
         If the frame of the data is not the source frame of the transform.
 

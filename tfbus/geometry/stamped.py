@@ -10,6 +10,7 @@ from tfbus.geometry.transform import Transform, from_row
 from tfbus.plain import from_fields, printable
 from tfbus.rows import Row
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, StampLike, as_stamp, format_duration, format_stamp, is_real
+from tfbus.tf2_names import says_ours
 from tfbus.which_kernel import kernel
 
 if kernel == "python":
@@ -25,6 +26,7 @@ _NO_BEGINNING = ("", "/")
 """The first characters of strings that are not frame names."""
 
 
+@says_ours
 class TransformStamped(Sample):
     """A transform with its two frames and its stamp: a published sample, or the answer of a lookup. Immutable.
 
@@ -257,13 +259,23 @@ def as_batch(samples: TransformStamped | Iterable[TransformStamped]) -> Batch:
     """
     if isinstance(samples, TransformStamped):
         return (samples,)
-    if isinstance(samples, (str, bytes)) or not isinstance(samples, Iterable):
-        raise TypeError(f"expected a TransformStamped or an iterable of them, not {samples!r}")
+    if isinstance(samples, (str, bytes, Mapping)) or not isinstance(samples, Iterable):
+        raise TypeError(f"expected a TransformStamped or an iterable of them, not {samples!r}{_instead(samples)}")
     batch = tuple(samples)
     for sample in batch:
         if not isinstance(sample, TransformStamped):
-            raise TypeError(f"expected a TransformStamped, not {sample!r}")
+            raise TypeError(f"expected a TransformStamped, not {sample!r}{_instead(sample)}")
     return batch
+
+
+def _instead(thing: object) -> str:
+    """The advice for something that is no sample but looks like a message of ROS or a transform; else empty."""
+    fields = thing.keys() if isinstance(thing, Mapping) else dir(thing)
+    if "child_frame_id" in fields:
+        return ": convert a ROS message with from_message first"
+    if "transforms" in fields:
+        return ": convert each of a message's transforms with from_message first"
+    return ": a TransformStamped has its frames and its stamp too" if isinstance(thing, Transform) else ""
 
 
 MAX_TRANSLATION = 1e12

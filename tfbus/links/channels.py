@@ -7,7 +7,8 @@ rate; its messages have no numbers. A message for a channel without listeners is
 """
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from math import inf
 from typing import Final
 
 from tfbus.links.endpoint import MAX_PEERS
@@ -27,8 +28,6 @@ from tfbus.links.seams import SendReport, Wire
 
 ALL: Final = "all"
 SLOW: Final = "slow"
-QUIET: Final = "none"
-"""Only signs of life go there, for a link that asks lookups and wants nothing else."""
 MOST_FILTERS = 100
 LONGEST_FILTER = 2**16
 """Bytes; a link whose names take more receives all frames, and drops the unwanted ones."""
@@ -36,7 +35,6 @@ FULL_MESSAGE = 5_000
 """A message with so many samples and removals is full; the batch that fills it is still whole."""
 _FORGOTTEN = 30.0
 """s after which a filter without listeners is forgotten."""
-_PER_MESSAGE = 1_000
 
 
 def filter_name(frames: Collection[str]) -> str:
@@ -45,32 +43,18 @@ def filter_name(frames: Collection[str]) -> str:
     return hash_bytes(text, 16).hex() if len(text) <= LONGEST_FILTER else ALL
 
 
+QUIET: Final = filter_name(())
+"""The filter of no frames, for a link that asks lookups and wants nothing else."""
+
+
+@dataclass(eq=False, slots=True)
 class _Channel:
-    """One numbered channel."""
+    """One stream of messages about some frames, None for all, and the names by which peers hear it."""
 
-    __slots__ = ("frames", "heard_at", "name", "number")
-
-    def __init__(self, name: str, frames: frozenset[str] | None, now: float) -> None:
-        self.name = name
-        self.frames = frames
-        self.number = 0
-        self.heard_at = now
-
-    def part(self, entries: Sequence[Entry]) -> Sequence[Entry]:
-        """The part of some entries that goes here."""
-        frames = self.frames
-        if frames is None:
-            return entries
-        found: list[Entry] = []
-        for entry in entries:
-            if isinstance(entry, RemovedFrame):
-                if entry.frame in frames:
-                    found.append(entry)
-                continue
-            samples = tuple(sample for sample in entry.samples if sample._fields[1] in frames)
-            if samples:
-                found.append(OutgoingBatch(entry.origin, entry.sequence, samples))
-        return found
+    frames: frozenset[str] | None
+    names: list[str]
+    heard_at: float = inf
+    number: int = 0
 
 
 class Channels:
@@ -83,43 +67,45 @@ class Channels:
         The sender's own bus.
     partial : bool
         Whether this link sends and takes some frames only.
+    slow_rate : float
+        How often the newest samples are sent, in Hz.
     report : SendReport
     """
 
-    def __init__(self, wire: Wire, bus: bytes, partial: bool, report: SendReport) -> None:
+    def __init__(self, wire: Wire, bus: bytes, partial: bool, slow_rate: float, report: SendReport) -> None:
         self._wire = wire
         self._bus = bus
         self._partial = partial
         self._report = report
-        self._all = _Channel(ALL, None, 0.0)
-        self._filters: dict[str, _Channel] = {}
-        # The names of filters beyond the bound.
-        self._whole: dict[str, None] = {}
+        self._all = _Channel(None, [ALL])
+        self._slow = _Channel(None, [SLOW])
+        self._channels = [self._all, self._slow, _Channel(frozenset(), [QUIET])]
         self._newest: dict[str, OutgoingBatch] = {}
+        self._slow_period = 1 / slow_rate
+        self._slow_due = -inf
         self._time: int | None = None
 
     def serve(self, frames: frozenset[str], now: float) -> None:
         """Publish a filter from now on; beyond `MOST_FILTERS`, its listeners receive everything."""
         name = filter_name(frames)
-        if name in self._filters or name == ALL:
+        if any(name in channel.names for channel in self._channels):
             return
-        if len(self._filters) < MOST_FILTERS:
-            self._filters[name] = _Channel(name, frames, now)
-        elif name not in self._whole:
-            unheard = [each for each in self._whole if not self._wire.is_heard(each)]
-            for each in unheard:
-                del self._whole[each]
-            if len(self._whole) < MAX_PEERS:
-                self._whole[name] = None
+        if len(self._channels) < MOST_FILTERS + 3:
+            self._channels.append(_Channel(frames, [name], now))
+        else:
+            heard = filter(self._wire.is_heard, self._all.names[1:])
+            self._all.names = [ALL, *heard, name][: 1 + MAX_PEERS]
 
     def send(self, turn: Turn, now: float) -> None:
         """Publish what one turn has gathered."""
         if turn.time is not None:
             self._time = turn.time
-        if self._wire.is_heard(SLOW):
-            self._note_newest(turn.entries)
-        for channel in (self._all, *list(self._filters.values())):
-            entries = channel.part(turn.entries)
+        for channel in list(self._channels):
+            if channel is self._slow:
+                self._note_newest(turn.entries, now)
+                continue
+            parts = (entry.within(channel.frames) for entry in turn.entries)
+            entries = [part for part in parts if part is not None]
             if not entries and turn.time is None:
                 continue
             if self._is_heard(channel, now):
@@ -129,37 +115,43 @@ class Channels:
 
     def sign(self, replica: Replica, now: float, reach: Sequence[Way], serves: bool) -> None:
         """Publish a sign of life on each channel."""
-        unnumbered = (_Channel(name, None, now) for name in (SLOW, QUIET))
-        for channel in (self._all, *list(self._filters.values()), *unnumbered):
+        for channel in list(self._channels):
             if self._is_heard(channel, now):
                 claim = replica.claim(now, channel.frames)._replace(partial=self._partial)
                 sign = Outgoing(Kind.SIGN, self._bus, channel.number, claim, self._time, reach, serves)
-                self._wire.publish(channel.name, write_message(sign))
-                if channel is self._all and self._whole:
+                first, *others = channel.names
+                self._wire.publish(first, write_message(sign))
+                if others:
                     # A copy of some frames is not to be compared with that of all.
-                    sign = replace(sign, claim=claim._replace(partial=True))
-                    for name in self._whole:
-                        self._wire.publish(name, write_message(sign))
+                    message = write_message(replace(sign, claim=claim._replace(partial=True)))
+                    for name in others:
+                        self._wire.publish(name, message)
 
-    def send_slowly(self) -> None:
-        """Publish the newest sample of each moving frame that was sent since this was called last."""
-        if not self._newest or not self._wire.is_heard(SLOW):
-            return
-        batches = [batch for batch in self._newest.values() if can_hold(batch.samples[0])]
-        self._newest.clear()
-        for first in range(0, len(batches), _PER_MESSAGE):
-            self._write(_Channel(SLOW, None, 0.0), batches[first : first + _PER_MESSAGE])
+    def send_slowly(self, now: float) -> float:
+        """Publish the newest sample of each moving frame if it is time; returns the next time for that."""
+        if not self._wire.is_heard(SLOW):
+            return inf
+        if now >= self._slow_due:
+            self._slow_due = now + self._slow_period
+            batches = [batch for batch in self._newest.values() if can_hold(batch.samples[0])]
+            self._newest.clear()
+            if batches:
+                self._write(self._slow, batches)
+        return self._slow_due
 
     def _is_heard(self, channel: _Channel, now: float) -> bool:
-        if self._wire.is_heard(channel.name) or (channel is self._all and any(map(self._wire.is_heard, self._whole))):
-            channel.heard_at = now
+        if any(map(self._wire.is_heard, channel.names)):
+            channel.heard_at = max(channel.heard_at, now)
             return True
-        if channel.frames is not None and now - channel.heard_at > _FORGOTTEN:
-            del self._filters[channel.name]
+        if now - channel.heard_at > _FORGOTTEN:
+            self._channels.remove(channel)
         return False
 
-    def _note_newest(self, entries: Iterable[Entry]) -> None:
+    def _note_newest(self, entries: Iterable[Entry], now: float) -> None:
         newest = self._newest
+        if not self._is_heard(self._slow, now):
+            newest.clear()
+            return
         for entry in entries:
             if isinstance(entry, RemovedFrame):
                 newest.pop(entry.frame, None)
@@ -184,7 +176,7 @@ class Channels:
 
     def _write_one(self, channel: _Channel, entries: list[Entry]) -> None:
         """One message of all entries if possible, else several; what cannot be sent is left out and reported."""
-        number = 0 if channel.name == SLOW else channel.number + 1
+        number = 0 if channel is self._slow else channel.number + 1
         out = Outgoing(Kind.LIVE, self._bus, number, time=self._time)
         try:
             message = write_message(out, entries)
@@ -192,10 +184,8 @@ class Channels:
             failure: Exception = error
         else:
             channel.number = number
-            self._wire.publish(channel.name, message)
-            if channel is self._all:
-                for name in self._whole:
-                    self._wire.publish(name, message)
+            for name in channel.names:
+                self._wire.publish(name, message)
             self._report.sent(sum(map(size_of, entries)))
             return
         sendable = [kept for kept in map(self._sendable, entries) if kept is not None]

@@ -1,16 +1,16 @@
 """The end of a link of tfbus, between the relay of its bus and a wire; `tfbus.links.replica` tells the protocol."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+import re
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from math import inf
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 from tfbus.bus.bus import Bus
-from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
 from tfbus.links.endpoint import MAX_PEERS, Endpoint
-from tfbus.links.history import HistoryAsker, chunk_of_past
+from tfbus.links.history import LONGEST_HISTORY, HistoryAsker, chunk_of_past
 from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import (
     LONGEST_WAY,
@@ -38,6 +38,7 @@ from tfbus.links.relay import (
 )
 from tfbus.links.replica import CHUNK, Agreement, Claim, Entry, Places, Replica, TooManyEntriesError
 from tfbus.links.seams import Hearing, Joined, Left, Presence, Received, Wire, WireItem
+from tfbus.stamps import as_duration
 from tfbus.tf_message import MalformedMessageError
 
 SIGN_PERIOD = 1.0
@@ -54,9 +55,22 @@ MOST_ROBOTS = 100
 """The most robots without a link whose copies are kept."""
 MOST_WAITING = 10_000
 """The most links that wait until a peer leaves."""
+_LONGEST_NAME = 200
 _LARGEST_GAP = 2**32
 _URGENT = frozenset(Kind) - {Kind.LIVE, Kind.SIGN}
 _FOLLOWS = frozenset({Kind.MEETING, Kind.ANSWER, Kind.PAST})
+
+
+class EndOptions(TypedDict, total=False):
+    """The parameters of `DomainEnd` that are for users; `tfbus.links.DomainLink` explains them."""
+
+    robot: str | None
+    robots: Iterable[str] | Mapping[str, float] | None
+    slow_rate: float
+    frames: Iterable[str] | None
+    drop_lost: bool
+    max_frames: int
+    history: float | None
 
 
 class DomainEnd(Endpoint):
@@ -64,20 +78,14 @@ class DomainEnd(Endpoint):
 
     Parameters
     ----------
-    bus, name, frames, drop_lost, max_frames
-        As for `Endpoint`.
+    bus : Bus
+    name : str
+        The domain.
     wire : Wire
-    robot : str
-        The robot whose frames this bus brings; empty without one.
-    robots : dict of str to float
-        Patterns of the robots that are heard, each with a rate in Hz; infinite for everything, 0 for presence and
-        lookups only.
-    slow_rate : float
-        How often the newest samples go to links that hear this one at a finite rate, in Hz.
-    history : float or None
-        How many seconds of the past each new peer is asked for.
     now : callable
         Returns a monotonic time in s.
+    **options
+        See `tfbus.links.DomainLink`, which also lists the errors.
 
     Attributes
     ----------
@@ -92,30 +100,40 @@ class DomainEnd(Endpoint):
         name: str,
         wire: Wire,
         *,
+        robot: str | None = None,
+        robots: Iterable[str] | Mapping[str, float] | None = None,
+        slow_rate: float = 1.0,
         frames: Iterable[str] | None = None,
         drop_lost: bool = False,
         max_frames: int = 10_000,
-        robot: str = "",
-        robots: dict[str, float] | None = None,
-        slow_rate: float = 1.0,
         history: float | None = None,
         now: Callable[[], float] = monotonic,
     ) -> None:
+        if isinstance(robots, str):
+            raise TypeError(f"robots must be several names, not {robots!r}")
+        if robot is not None:
+            check_name("a robot's name", robot, r"[\w.-]+", "letters, digits, '-', '_' and '.'")
+        rates = robots if isinstance(robots, Mapping) else dict.fromkeys(("*",) if robots is None else robots, inf)
+        for pattern in rates:
+            check_name("the name of a robot", pattern, r"[\w.*-]+", "letters, digits, '-', '_' and '.', or '*' for any")
+        # Not a number is not greater either.
+        if not 0 < slow_rate < inf or any(not rate >= 0 for rate in rates.values()):
+            raise ValueError(f"a rate must be greater than zero, got {rates!r} and {slow_rate!r} Hz")
+        if history is not None and not 0 < as_duration(history, "history") <= LONGEST_HISTORY:
+            raise ValueError(f"history must be a time that passes, {LONGEST_HISTORY:g} s at most, got {history}")
         super().__init__(bus, name, wire, frames, drop_lost, max_frames)
         self._now = now
         self._wire = wire
-        self._robot = robot
-        self._slow_period = 1 / slow_rate
-        self._channel = ALL if self.frames is None else filter_name(self.frames)
+        self._robot = robot or ""
+        channel = ALL if self.frames is None else filter_name(self.frames)
         # Whether peers are to send the wanted frames only.
-        self._filters = self._channel != ALL
-        channels = {inf: self._channel, 0.0: QUIET}
-        rates = {"*": inf} if robots is None else robots
+        self._filters = channel != ALL
+        channels = {inf: channel, 0.0: QUIET}
         self._rates = {Hearing(pattern, channels.get(rate, SLOW)): rate for pattern, rate in rates.items()}
-        self._channels = Channels(wire, self.relay.origin, self.frames is not None, self.report)
+        self._channels = Channels(wire, self.relay.origin, self.frames is not None, slow_rate, self.report)
         self._places = Places(self.max_frames)
         self._replicas: dict[str, Replica] = {}
-        self.own = self._replica_of(robot)
+        self.own = self._replica_of(self._robot)
         self._agreement = Agreement()
         self._history = HistoryAsker(history or 0.0, self._ask_past, now)
         self.lookups = RemoteLookups(wire.send, name)
@@ -129,7 +147,6 @@ class DomainEnd(Endpoint):
         self._signed_at = -inf
         self._hurries = False
         self._sign_period = SIGN_PERIOD
-        self._slow_due = -inf
 
     # For the link
 
@@ -166,12 +183,7 @@ class DomainEnd(Endpoint):
             self._sign_period = min(2 * self._sign_period, max(self._wire.rest, LONGEST_SIGN_PERIOD_EACH * peers))
             self._sign(now)
         due = min(due, self._sign_due, self._history.next_due(), self._answers_due if self._questions else inf)
-        if self._wire.is_heard(SLOW):
-            if now >= self._slow_due:
-                self._slow_due = now + self._slow_period
-                self._channels.send_slowly()
-            due = min(due, self._slow_due)
-        return due
+        return min(due, self._channels.send_slowly(now))
 
     def _ask(self, now: float) -> None:
         """Ask the question that is due, unless it is put off."""
@@ -214,24 +226,19 @@ class DomainEnd(Endpoint):
     keeps_withdrawn = True
 
     def keep(self, entry: OutgoingBatch | RemovedFrame) -> None:
-        rank = entry.sequence, entry.origin
-        if isinstance(entry, RemovedFrame):
-            if self.frames is None or entry.frame in self.frames:
-                self.own.note(entry.frame, rank, None, ours=True)
+        rank, wanted = (entry.sequence, entry.origin), entry.within(self.frames)
+        if isinstance(wanted, RemovedFrame):
+            self.own.note(wanted.frame, rank, None, ours=True)
             return
-        for sample in entry.samples:
+        for sample in () if wanted is None else wanted.samples:
             _, child, _, _, _, static = sample._fields
-            if (self.frames is None or child in self.frames) and can_hold(sample):
+            if can_hold(sample):
                 with suppress(TooManyEntriesError):
                     self.own.note(child, rank, sample, ours=True, settles=not static)
 
     def kept(self) -> Iterator[OutgoingBatch | RemovedFrame]:
         for replica in self._replicas.values():
             yield from replica.told()
-
-    def own_sample(self, frame: str, /) -> TransformStamped | None:
-        entry = self.own.entries.get(frame)
-        return None if entry is None or entry.origin != self.relay.origin else entry.sample
 
     def ways(self) -> Iterator[Way]:
         for peer in self.peers.values():
@@ -432,7 +439,7 @@ class DomainEnd(Endpoint):
         """Note the samples of a batch in a copy; returns the samples that the relay has to judge."""
         samples = self._wanted(samples)
         rank, peer = provenance.rank, provenance.peer
-        if provenance.origin == self.relay.origin or (live and replica.note_moving(samples, rank)):
+        if live and replica.note_moving(samples, rank):
             return samples
         kept: list[ReceivedTransform] = []
         for sample in samples:
@@ -458,14 +465,11 @@ class DomainEnd(Endpoint):
         return samples if frames is None else [sample for sample in samples if sample._fields[1] in frames]
 
     def _take_removal(self, peer: Peer, replica: Replica, removal: RemovedFrame) -> bool:
-        if self.frames is not None and removal.frame not in self.frames:
-            return False
-        if not self._admit_number(peer, removal.sequence, 1):
+        if removal.within(self.frames) is None or not self._admit_number(peer, removal.sequence, 1):
             return False
         provenance = Provenance(removal.origin, removal.sequence, self, peer)
-        is_own = removal.origin == self.relay.origin
-        is_new = not is_own and replica.note(removal.frame, provenance.rank, None)
-        if is_new or is_own:
+        is_new = replica.note(removal.frame, provenance.rank, None)
+        if is_new:
             self.relay.remove(provenance, removal.frame)
         return is_new
 
@@ -692,3 +696,10 @@ class _Due(NamedTuple):
 
     kind: Kind
     data: bytes
+
+
+def check_name(what: str, name: str, pattern: str, letters: str) -> str:
+    """Return a name; raises `ValueError` if it does not match a pattern, which the error tells as `letters`."""
+    if len(name) > _LONGEST_NAME or not re.fullmatch(pattern, name, re.ASCII):
+        raise ValueError(f"{what} is made of {letters}, {_LONGEST_NAME} at most, not {name!r}")
+    return name

@@ -21,7 +21,7 @@ from tfbus._aio.web_door import HEAD_END, HEAD_TIME, MAX_HEAD, WebDoor
 from tfbus.bus.bus import Bus
 from tfbus.errors import BusClosedError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.registration import Registration, warn_unless_entered
+from tfbus.registration import AsyncOnly, Registration, warn_unless_entered
 from tfbus.stamps import SECOND
 
 try:
@@ -41,7 +41,7 @@ _STAMP_END = 2**32 * SECOND
 """ns; Foxglove counts the seconds of a stamp in 32 bits, from zero."""
 
 
-class FoxgloveServer:
+class FoxgloveServer(AsyncOnly):
     """Sends everything that a bus publishes to the Foxglove application: ``async with FoxgloveServer(bus) as server``.
 
     The transforms are messages of the type ``foxglove.FrameTransforms``; who subscribes later gets the static ones at

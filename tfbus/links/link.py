@@ -1,13 +1,12 @@
 """The half that all links share: it joins a bus to a network for as long as its ``async with`` lasts."""
 
 import math
-import re
 import threading
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from time import monotonic
 from types import TracebackType
-from typing import Any, Final, Self, TypedDict
+from typing import Any, Final, Self, Unpack
 
 import anyio
 import anyio.abc
@@ -20,19 +19,17 @@ from tfbus.bus.queues import check_capacity
 from tfbus.clock import SimulatedClock
 from tfbus.errors import BusClosedError
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.domain import DomainEnd
+from tfbus.links.domain import DomainEnd, EndOptions, check_name
 from tfbus.links.endpoint import Endpoint, HearsTime
-from tfbus.links.history import LONGEST_HISTORY
 from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import RemoteQuestion
 from tfbus.links.seams import Presence, Received, Wire
-from tfbus.registration import Registration, warn_unless_entered
+from tfbus.registration import AsyncOnly, Registration, warn_unless_entered
 from tfbus.stamps import LATEST, Latest, as_duration, as_stamp, from_seconds, to_seconds
 from tfbus.statistics import LinkStatistics, QueueStatistics
 from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.lookup import Hold, policy_of
 
-_LONGEST_NAME = 200
 _FULL_TURN = 5_000
 """With so many samples and removals, the outbox is sent before the turn of the event loop ends."""
 MANY = 100
@@ -186,7 +183,7 @@ class ClockFollower:
                 await self._heard.wait()
 
 
-class Link:
+class Link(AsyncOnly):
     """Joins a bus to other buses, or to another world: ``async with link``.
 
     The samples that are published in one turn of the event loop are sent together at its end. Received messages wait in
@@ -422,17 +419,10 @@ class Link:
             self._end.clock_jumped_back()
 
 
-class DomainOptions(TypedDict, total=False):
+class DomainOptions(EndOptions, total=False):
     """The parameters that all links of tfbus have in common; `DomainLink` explains them."""
 
-    robot: str | None
-    robots: Iterable[str] | Mapping[str, float] | None
-    slow_rate: float
-    frames: Iterable[str] | None
-    drop_lost: bool
-    max_frames: int
     capacity: int
-    history: float | None
     clock: SimulatedClock | HearsTime | None
     tell_clock: bool
 
@@ -510,45 +500,14 @@ class DomainLink(Link):
         domain: str,
         wire: Wire,
         *,
-        robot: str | None = None,
-        robots: Iterable[str] | Mapping[str, float] | None = None,
-        slow_rate: float = 1.0,
-        frames: Iterable[str] | None = None,
-        drop_lost: bool = False,
-        max_frames: int = 10_000,
         capacity: int = 10_000,
-        history: float | None = None,
         clock: SimulatedClock | HearsTime | None = None,
         tell_clock: bool = False,
+        **options: Unpack[EndOptions],
     ) -> None:
-        if isinstance(robots, str):
-            raise TypeError(f"robots must be several names, not {robots!r}")
-        if robot is not None:
-            check_robot(robot)
-        rates = robots if isinstance(robots, Mapping) else dict.fromkeys(("*",) if robots is None else robots, math.inf)
-        for pattern in rates:
-            check_robots(pattern)
-        # Not a number is not greater either.
-        if not slow_rate > 0 or any(not rate >= 0 for rate in rates.values()):
-            raise ValueError(f"a rate must be greater than zero, got {rates!r} and {slow_rate!r} Hz")
-        if slow_rate == math.inf:
-            raise ValueError("slow_rate must be finite")
-        if history is not None and not 0 < as_duration(history, "history") <= LONGEST_HISTORY:
-            raise ValueError(f"history must be a time that passes, {LONGEST_HISTORY:g} s at most, got {history}")
         self.domain = check_domain(domain)
-        self.robot = robot
-        self._domain_end = DomainEnd(
-            bus,
-            domain,
-            wire,
-            frames=frames,
-            drop_lost=drop_lost,
-            max_frames=max_frames,
-            robot=robot or "",
-            robots=dict(rates),
-            slow_rate=slow_rate,
-            history=history,
-        )
+        self.robot = options.get("robot")
+        self._domain_end = DomainEnd(bus, domain, wire, **options)
         super().__init__(self._domain_end, capacity=capacity, clock=clock, tell_clock=tell_clock)
 
     @property
@@ -622,25 +581,6 @@ class DomainLink(Link):
 
 def check_domain(domain: str) -> str:
     """Return the name of a domain; raises `ValueError` if it is malformed."""
-    if len(domain) > _LONGEST_NAME or not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", domain, re.ASCII):
-        raise ValueError(
-            "a domain is made of letters, digits, '-', '_' and '.', with '/' between them, "
-            f"{_LONGEST_NAME} at most, not {domain!r}"
-        )
-    return domain
-
-
-def check_robot(robot: str) -> str:
-    """Return the name of a robot; raises `ValueError` if it is malformed."""
-    if len(robot) > _LONGEST_NAME or not re.fullmatch(r"[\w.-]+", robot, re.ASCII):
-        raise ValueError(
-            f"a robot's name is made of letters, digits, '-', '_' and '.', {_LONGEST_NAME} at most, not {robot!r}"
-        )
-    return robot
-
-
-def check_robots(pattern: str) -> str:
-    """Return a pattern for the names of robots; raises `ValueError` if no name can match it."""
-    if len(pattern) > _LONGEST_NAME or not re.fullmatch(r"[\w.*-]+", pattern, re.ASCII):
-        raise ValueError(f"the name of a robot, or a pattern such as 'r*', is needed, not {pattern!r}")
-    return pattern
+    return check_name(
+        "a domain", domain, r"[\w.-]+(/[\w.-]+)*", "letters, digits, '-', '_' and '.', with '/' between them"
+    )

@@ -34,7 +34,7 @@ from tfbus.links.message import (
     write_body,
     write_question,
 )
-from tfbus.registration import warn_unless_entered
+from tfbus.registration import AsyncOnly, warn_unless_entered
 from tfbus.statistics import BufferServerStatistics
 from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.lookup import Hold
@@ -239,7 +239,7 @@ class Serving(Protocol):
         """Say to all peers whether this link serves a buffer."""
 
 
-class BufferServer:
+class BufferServer(AsyncOnly):
     """Answers lookups of other processes from a buffer: ``async with BufferServer(buffer, link)``.
 
     `DomainLink.lookup` asks it. A question waits like any lookup of the buffer. It does the work of tf2's BufferServer.

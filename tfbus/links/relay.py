@@ -2,13 +2,15 @@
 
 Every batch is numbered by the bus on which it was published first, its *origin*. The same batch may arrive on several
 ways, for a bus with two links passes samples on between them. So a sample is news only if its number is
-higher than that of the newest sample of the same origin and child; then no ring of buses has an echo.
+higher than that of the newest sample of the same origin and child; then no ring of buses has an echo. For each child,
+the numbers of `MOST_ORIGINS` origins are remembered, and the highest number of all others.
 
 The number of a batch is the machine's time in microseconds, or one more than the highest number that the bus has seen
 of any origin, whichever is higher (a hybrid logical clock: Kulkarni, Demirbas, Madappa, Avva and Leone, "Logical
 physical clocks", 2014). So of two statements on one frame, such as a static sample and a removal, the later one has the
 higher number and holds on every bus, in whatever order they arrive: also if the two buses were parted, as far as the
-clocks of their machines agree, and if a program was started again.
+clocks of their machines agree, and if a program was started again. Somebody who makes up a sample of this bus with a
+higher number is heard like anybody else, and this bus numbers on above it.
 
 Batches of a world that has no origins, such as ROS, get this bus as their origin. Such a world gives samples back that
 it was sent, by another link of this bus or by another bus, without a mark. So while a link to such a world is attached,
@@ -24,7 +26,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby, islice
+from itertools import groupby
 from math import inf
 from time import time_ns
 from typing import Any
@@ -39,12 +41,9 @@ from tfbus.rows import Row
 LARGEST_JUMP = 2**52
 """A number may be so far ahead of this machine's time: 142 years in us, for some machines begin in 1970."""
 MANY_PEERS = 20
-"""All origins together may have this many times the frames of one origin."""
-MAX_ORIGINS = 10_000
-MOST_LOST = 1_000
-"""The most lost buses whose numbers are remembered, because copies of their samples may still be on the way."""
-_LEAP = 2**16
-"""A bus skips so many numbers behind a forged number of its own, because the forger may use the next ones too."""
+"""The frames of all peers together may be so many times the frames of one."""
+MOST_ORIGINS = 8
+"""The most origins whose numbers are remembered for each frame."""
 _REMEMBERED = 10_000
 _PER_CHILD = 256
 _GONE_CHILDREN = 1_000
@@ -72,6 +71,13 @@ class OutgoingBatch:
     sequence: int
     samples: Sequence[TransformStamped]
 
+    def within(self, frames: Collection[str] | None) -> "OutgoingBatch | None":
+        """The part of it that is about some frames; None if it has none."""
+        if frames is None:
+            return self
+        samples = tuple(sample for sample in self.samples if sample._fields[1] in frames)
+        return OutgoingBatch(self.origin, self.sequence, samples) if samples else None
+
 
 @dataclass(frozen=True, slots=True)
 class RemovedFrame:
@@ -80,6 +86,10 @@ class RemovedFrame:
     origin: bytes
     sequence: int
     frame: str
+
+    def within(self, frames: Collection[str] | None) -> "RemovedFrame | None":
+        """The removal itself if it is of one of some frames; None if not."""
+        return self if frames is None or self.frame in frames else None
 
 
 @dataclass(slots=True)
@@ -125,13 +135,11 @@ class Outbox:
         self.pending = 0
         self._entries: list[OutgoingBatch | RemovedFrame] = []
 
-    def add_batch(self, batch: OutgoingBatch, echo: bool = False) -> None:
+    def add_batch(self, published: OutgoingBatch, echo: bool = False) -> None:
         """Add samples that were published; an echo, samples that came in by this very link, does not go out."""
-        if self.frames is not None:
-            wanted = tuple(sample for sample in batch.samples if sample.child in self.frames)
-            if not wanted:
-                return
-            batch = OutgoingBatch(batch.origin, batch.sequence, wanted)
+        batch = published.within(self.frames)
+        if batch is None:
+            return
         if not echo:
             self._entries.append(batch)
             self.pending += len(batch.samples)
@@ -143,7 +151,7 @@ class Outbox:
 
         A frame is withdrawn rather than removed if it left this bus only because its owner was lost.
         """
-        if self.frames is not None and removal.frame not in self.frames:
+        if removal.within(self.frames) is None:
             return
         goes_out = not echo and not (withdrawn and self.keeps_withdrawn)
         if goes_out:
@@ -158,10 +166,6 @@ class Outbox:
     def kept(self) -> Iterable[OutgoingBatch | RemovedFrame]:
         """The entries that this link knows, for another link that begins later."""
         return ()
-
-    def own_sample(self, _frame: str, /) -> TransformStamped | None:
-        """The newest sample of a frame of this bus, to send again after a forged number has hidden it."""
-        return None
 
     def ways(self) -> Iterable[tuple[bytes, tuple[bytes, ...]]]:
         """The buses that the peers of this link lead to, each with the buses on the way there."""
@@ -311,17 +315,13 @@ class Relay:
         self._bus = bus
         self._registration: Registration | None = None
         self._outboxes: list[Outbox] = []
-        # The newest number that each origin has given a frame; how many frames each origin has, and all together.
+        # The newest number that each origin has given a frame, and under b"" the highest of the forgotten origins.
         self._newest: dict[str, dict[bytes, int]] = {}
-        self._held: Counter[bytes] = Counter()
-        self._frames = 0
         self._latest: dict[str, Provenance] = {}
         self._settled: dict[str, Rank] = {}
         self._removed: dict[str, Rank] = {}
         self._removing: tuple[str, Provenance | None] | None = None
         self._ways: Counter[bytes] = Counter()
-        # The buses to which no way leads any more, in the order in which they were lost.
-        self._lost: dict[bytes, None] = {}
         self._passed: PassedSamples | None = None
 
     def attach(self, outbox: Outbox, foreign: bool = False) -> None:
@@ -388,7 +388,7 @@ class Relay:
         received : iterable of (Provenance, iterable of ReceivedTransform)
             All of one peer.
         max_frames : int
-            How many frames one origin may have.
+            How many frames one peer may have; all together may have `MANY_PEERS` times as many.
 
         Returns
         -------
@@ -399,10 +399,7 @@ class Relay:
         news: list[ReceivedTransform] = []
         refused = 0
         for provenance, samples in received:
-            if provenance.origin != self.origin:
-                refused += self._find_news(provenance, samples, max_frames, news)
-            else:
-                self._outnumber(provenance.sequence, {sample.child for sample in samples})
+            refused += self._find_news(provenance, samples, MANY_PEERS * max_frames, news)
         if news:
             self._bus.publish(news, invalid="drop")
         return len(news), refused
@@ -417,17 +414,22 @@ class Relay:
         bounds the frames of the peer.
         """
         provenance = Provenance(self.origin, self._next_number(), outbox, peer)
-        news: list[ReceivedTransform] = []
-        refused = self._find_news(provenance, samples, max_frames, news)
-        if news:
-            self._bus.publish(news, invalid="drop")
-        return len(news), refused
+        assert self._passed is not None
+        admitted: list[ReceivedTransform] = []
+        refused = 0
+        for sample in samples:
+            if sample in self._passed:
+                continue
+            if sample.child in peer.frames or len(peer.frames) < max_frames:
+                peer.frames.add(sample.child)
+                admitted.append(sample)
+            else:
+                refused += 1
+        published, beyond = self.publish([(provenance, admitted)], max_frames)
+        return published, refused + beyond
 
     def remove(self, provenance: Provenance, frame: str) -> None:
         """Remove a frame from the bus, unless something newer was said of it."""
-        if provenance.origin == self.origin:
-            self._outnumber(provenance.sequence, {frame})
-            return
         self._number = max(self._number, provenance.sequence)
         latest = self._latest.get(frame)
         newest = self._newest.get(frame, {}).get(provenance.origin, -1)
@@ -455,24 +457,6 @@ class Relay:
                         self._passed.forget(frame)
         return frames
 
-    def say_again(self, frames: Iterable[str]) -> None:
-        """Send the own frames among some frames again, with new numbers, so that they are news on all other buses."""
-        own = [frame for frame in sorted(frames) if frame in self._latest and self._latest[frame].origin == self.origin]
-        if not own:
-            return
-        for frame in own:
-            latched = self._bus._topology.latched.samples.get(frame)
-            kept = (latched, *(outbox.own_sample(frame) for outbox in self._outboxes))
-            sample = next((sample for sample in kept if sample is not None), None)
-            if sample is not None:
-                latest = self._latest[frame]
-                again = Provenance(self.origin, self._next_number(), latest.outbox, latest.peer)
-                self._latest[frame] = again
-                if sample.static:
-                    self._settled[frame] = again.rank
-                for outbox in self._outboxes:
-                    outbox.add_batch(OutgoingBatch(again.origin, again.sequence, (sample,)))
-
     # Reach
 
     def reaches(self, origin: bytes) -> bool:
@@ -482,7 +466,6 @@ class Relay:
     def way_opened(self, origin: bytes) -> None:
         """Count one more way to a bus."""
         self._ways[origin] += 1
-        self._lost.pop(origin, None)
 
     def way_closed(self, origin: bytes) -> bool:
         """Count one way less to a bus; returns whether that was the last one."""
@@ -490,9 +473,6 @@ class Relay:
         if self._ways[origin] > 0:
             return False
         del self._ways[origin]
-        self._lost[origin] = None
-        if len(self._lost) > MOST_LOST:
-            self._forget_lost()
         return True
 
     def reach_besides(self, outbox: Outbox) -> dict[bytes, tuple[bytes, ...]]:
@@ -541,49 +521,40 @@ class Relay:
         self,
         provenance: Provenance,
         samples: Iterable[ReceivedTransform],
-        max_frames: int,
+        most_frames: int,
         news: list[ReceivedTransform],
     ) -> int:
         """Append the news of one batch to `news`; returns how many samples would add too many frames."""
         refused, before = 0, len(news)
-        peer = provenance.peer
-        assert peer is not None
         sequence, origin = provenance.sequence, provenance.origin
         self._number = max(self._number, sequence)
         rank = provenance.rank
-        while origin not in self._held and len(self._held) >= MAX_ORIGINS:
-            if not self._forget_lost():
-                return len(list(samples))
-        passed, foreign = self._passed, origin == self.origin
-        settled, removed = self._settled, self._removed
+        passed, settled, removed, is_own = self._passed, self._settled, self._removed, origin == self.origin
         for sample in samples:
             child, static = sample.child, sample.static
-            # A static one with an origin has to be ranked, so that all buses agree in the end.
-            if passed is not None and (foreign or not static) and sample in passed:
+            # A static one has to be ranked, so that all buses agree in the end.
+            if passed is not None and not static and sample in passed:
                 continue
-            if (child in settled or child in removed or static) and self._is_outranked(sample, rank):
+            if (child in settled or child in removed or static or is_own) and self._is_outranked(sample, rank):
                 continue
-            newest = self._newest.get(child)
-            known = None if newest is None else newest.get(origin)
-            if known is None:
-                held = len(peer.frames) if foreign else self._held[origin]
-                while self._frames >= MANY_PEERS * max_frames and self._forget_lost():
-                    pass
-                if held >= max_frames or self._frames >= MANY_PEERS * max_frames:
+            numbers = self._newest.get(child)
+            if numbers is None:
+                if len(self._newest) >= most_frames:
                     refused += 1
                     continue
-                if foreign:
-                    peer.frames.add(child)
-                # Other samples of the batch may be of the same child.
-                self._newest.setdefault(child, {})[origin] = -1
-                self._held[origin] += 1
-                self._frames += 1
-            elif known >= sequence:
+                numbers = self._newest[child] = {}
+            known = numbers.get(origin)
+            if (numbers.get(b"", -1) if known is None else known) >= sequence:
                 continue
             sample._provenance = provenance
             news.append(sample)
+        # Other samples of the batch may be of the same child.
         for sample in news[before:] if before else news:
-            self._newest[sample.child][origin] = sequence
+            numbers = self._newest[sample.child]
+            numbers[origin] = sequence
+            if len(numbers) > MOST_ORIGINS:
+                oldest = min(filter(None, numbers), key=numbers.__getitem__)
+                numbers[b""] = max(numbers.pop(oldest), numbers.get(b"", -1))
         return refused
 
     def _remove_from_bus(self, frame: str, provenance: Provenance | None) -> None:
@@ -655,53 +626,19 @@ class Relay:
             self._removed[frame] = provenance.rank
             if len(self._removed) > _REMEMBERED:
                 del self._removed[next(iter(self._removed))]
-        for origin in list(self._newest.get(frame, ())):
-            self._release(origin, frame)
-
-    def _forget_lost(self) -> bool:
-        """Forget the numbers of the buses that were lost first, half of all lost buses; False if none is lost.
-
-        Numbers of frames on this bus stay. The numbers of a bus are kept when it is lost, because a copy of its samples
-        may come later and would be news again.
-        """
-        gone = set(islice(self._lost, (len(self._lost) + 1) // 2))
-        for origin in gone:
-            del self._lost[origin]
-        for frame, newest in list(self._newest.items()) if gone else ():
-            latest = self._latest.get(frame)
-            for origin in newest.keys() & gone:
-                if latest is None or latest.origin != origin:
-                    self._release(origin, frame)
-        return bool(gone)
-
-    def _release(self, origin: bytes, frame: str) -> None:
-        newest = self._newest[frame]
-        del newest[origin]
-        if not newest:
-            del self._newest[frame]
-        self._frames -= 1
-        self._held[origin] -= 1
-        if not self._held[origin]:
-            del self._held[origin]
+        self._newest.pop(frame, None)
 
     def _is_outranked(self, sample: ReceivedTransform, rank: Rank) -> bool:
-        """Whether a removal, or a static sample of another bus, of a higher rank holds for the frame."""
+        """Whether a higher rank holds: of a removal or a static sample; for a static or own sample, of any."""
         _, child, _, _, _, static = sample._fields
         if rank < self._settled.get(child, LOWEST) or rank < self._removed.get(child, LOWEST):
             return True
         latest = self._latest.get(child)
-        return static and latest is not None and rank < latest.rank
+        return (static or rank[1] == self.origin) and latest is not None and rank <= latest.rank
 
     def _next_number(self) -> int:
         self._number = max(self._number + 1, time_ns() // 1_000)
         return self._number
-
-    def _outnumber(self, number: int, frames: Iterable[str]) -> None:
-        """Skip past a forged number of this bus, and send the frames again that it has hidden."""
-        if number > self._number:
-            self._number = number + _LEAP
-        latest = ((frame, self._latest.get(frame)) for frame in frames)
-        self.say_again(frame for frame, known in latest if known is not None and known.sequence < number)
 
 
 def relay_of(bus: Bus) -> Relay:

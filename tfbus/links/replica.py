@@ -62,6 +62,7 @@ import heapq
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
 from itertools import islice
 from math import inf
 from random import uniform
@@ -143,27 +144,24 @@ class TooManyEntriesError(ValueError):
     """A bus, or all together, has more frames than a copy holds."""
 
 
+@dataclass(eq=False, slots=True)
 class Places:
     """The room that all copies of one link have together.
 
-    Parameters
+    Attributes
     ----------
     max_frames : int
         How many frames one origin may have.
-
-    Attributes
-    ----------
     held : Counter
         How many frames each origin has, except the own one.
     taken, removals : int
         How many frames and removals there are.
     """
 
-    def __init__(self, max_frames: int) -> None:
-        self.max_frames = max_frames
-        self.held: Counter[bytes] = Counter()
-        self.taken = 0
-        self.removals = 0
+    max_frames: int
+    held: Counter[bytes] = field(default_factory=Counter)
+    taken: int = 0
+    removals: int = 0
 
 
 class Replica:
@@ -434,40 +432,43 @@ def _told(frame: str, entry: Entry) -> OutgoingBatch | RemovedFrame:
     return OutgoingBatch(entry.origin, entry.number, (entry.sample,))
 
 
+@dataclass(eq=False, slots=True)
 class _Copy:
-    """The copy of one peer, as far as it is known."""
+    """The copy of one peer, as far as it is known.
 
-    __slots__ = (
-        "again",
-        "claim",
-        "due",
-        "frames",
-        "fruitless",
-        "missed",
-        "must_ask",
-        "replica",
-        "seen",
-        "silences",
-        "urgent",
-    )
+    Attributes
+    ----------
+    replica : Replica
+        The own copy that is to agree with it.
+    seen : int
+        All changes up to this sequence are here.
+    must_ask : bool
+    frames : collection of str or None
+        The frames of the copy, if it has only some.
+    claim : Claim or None
+    due : float
+        The time of the next question.
+    again : float
+        The time of the next question if no sign comes before: the peer may not serve the filter.
+    urgent : bool
+        Whether the question is not put off.
+    missed : bool
+        Whether live messages are missing.
+    fruitless, silences : int
+        Answers without news, and questions without an answer, one after the other.
+    """
 
-    def __init__(self, replica: Replica, seen: int, must_ask: bool) -> None:
-        self.replica = replica
-        # The frames of the copy, if it has only some.
-        self.frames: Collection[str] | None = None
-        # The time of the next question if no sign comes before: the peer may not serve the filter.
-        self.again = inf
-        self.must_ask = must_ask
-        # All changes up to this sequence are here.
-        self.seen = seen
-        self.claim: Claim | None = None
-        self.due = inf
-        # Whether the question is not put off.
-        self.urgent = False
-        self.missed = False
-        # Answers without news, and questions without an answer, one after the other.
-        self.fruitless = 0
-        self.silences = 0
+    replica: Replica
+    seen: int
+    must_ask: bool
+    frames: Collection[str] | None = None
+    claim: Claim | None = None
+    due: float = inf
+    again: float = inf
+    urgent: bool = False
+    missed: bool = False
+    fruitless: int = 0
+    silences: int = 0
 
 
 class Question(NamedTuple):

@@ -26,7 +26,7 @@ from tfbus.events import RecordingDropped, RecordingFailed
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.plain import printable
 from tfbus.recording.formats.mcap_output import McapOutput
-from tfbus.registration import Registration
+from tfbus.registration import AsyncOnly, Registration
 from tfbus.statistics import RecorderStatistics
 
 
@@ -80,7 +80,7 @@ _FLUSH_PERIOD = 0.5
 _SLICE = 4_096
 
 
-class Recorder:
+class Recorder(AsyncOnly):
     """Records all samples of a bus: ``async with Recorder(bus, "run.mcap")``. The latched static samples come first.
 
     The file is MCAP as ROS 2 writes it, with the topics ``/tf`` and ``/tf_static``, so any tool that knows these can

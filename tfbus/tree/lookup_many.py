@@ -22,7 +22,7 @@ from tfbus.data import PointCloud
 from tfbus.errors import DisconnectedError, TransformLookupError
 from tfbus.geometry.transform_array import TransformArray, from_columns, move
 from tfbus.rows import IDENTITY, Columns, Row, compose, invert
-from tfbus.stamps import LATEST, Stamps
+from tfbus.stamps import LATEST, Latest, Stamps
 from tfbus.tree.forest import Forest, Path, Step
 from tfbus.tree.history import FrameHistory, Samples
 from tfbus.tree.lookup import Policy, answer, read_stamps_at_many
@@ -284,19 +284,36 @@ def lookup_many(
     return _composed(_answers(forest, queries, lookup_one, policy, out_of_range))
 
 
-def deskew(forest: Forest, cloud: PointCloud, target: str, fixed: str, out_of_range: OutOfRange) -> PointCloud:
-    """The cloud of `TransformTree.deskew`."""
+def deskew_stamps(cloud: PointCloud) -> tuple[int | Latest, Stamps]:
+    """The stamp at which a cloud is put into the target, and the stamps of its points; in ns.
+
+    Raises
+    ------
+    TypeError
+        If it is no cloud.
+    ValueError
+        If the points have no stamps.
+    """
+    if not isinstance(cloud, PointCloud):
+        hint = ": a scan becomes one by to_points()" if hasattr(cloud, "to_points") else ""
+        raise TypeError(f"deskew takes a PointCloud, not a {type(cloud).__name__}{hint}")
     if cloud.stamps is None:
         raise ValueError("the points of the cloud have no stamps")
     at = cloud.stamp
-    if at is LATEST and len(cloud):
-        at = int(cloud.stamps.max())
+    return (int(cloud.stamps.max()) if at is LATEST and len(cloud) else at), cloud.stamps
+
+
+def deskew(
+    forest: Forest, cloud: PointCloud, target: str, fixed: str, out_of_range: OutOfRange, policy: Policy | None
+) -> PointCloud:
+    """The cloud of `TransformTree.deskew`."""
+    at, stamps = deskew_stamps(cloud)
     check_out_of_range(out_of_range)
-    target_from_fixed = answer(forest, target, fixed, at, None, None, None, None)
-    query = Query(fixed, cloud.frame, cloud.stamps)
-    plain = plain_columns(forest, [query], out_of_range == "nan")
+    target_from_fixed = answer(forest, target, fixed, at, None, None, None, policy)
+    query = Query(fixed, cloud.frame, stamps)
+    plain = plain_columns(forest, [query], out_of_range == "nan") if policy is None else None
     if plain is None:
-        (answers,) = _answers(forest, [query], partial(_lookup_at, forest, query), None, out_of_range)
+        (answers,) = _answers(forest, [query], partial(_lookup_at, forest, query, policy=policy), policy, out_of_range)
         chunks = answers.chunks()
     else:
         chunks = _chunks_of(plain[0])
@@ -361,8 +378,8 @@ def _answers(
         # The missing samples have arrived since the copies were made.
 
 
-def _lookup_at(forest: Forest, query: Query, place: int) -> None:
-    answer(forest, query.target, query.source, int(query.stamps[place]), None, None, None, None)
+def _lookup_at(forest: Forest, query: Query, place: int, policy: Policy | None = None) -> None:
+    answer(forest, query.target, query.source, int(query.stamps[place]), None, None, None, policy)
 
 
 class Answers:

@@ -25,6 +25,8 @@ from tfbus.geometry.stamped import (
 from tfbus.geometry.transform_array import TransformArray, with_stamps
 from tfbus.stamps import (
     LATEST,
+    SECOND,
+    STAMP_MAX,
     AtLike,
     Latest,
     StampLike,
@@ -36,6 +38,7 @@ from tfbus.stamps import (
     format_stamp,
     from_seconds,
 )
+from tfbus.tf2_names import says_ours
 from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge, FrameHistory, Outcome, SavedFrame, samples_of, save_frame
@@ -46,6 +49,7 @@ from tfbus.tree.twist import twist
 from tfbus.which_kernel import plain_first
 
 
+@says_ours
 class TransformTree:
     """The transforms between any two frames, over the last few seconds.
 
@@ -390,7 +394,17 @@ class TransformTree:
         found = lookup_many(self._forest, target, source, asked, source_stamps, fixed, out_of_range, policy)
         return with_stamps(found, asked)
 
-    def deskew(self, cloud: PointCloud, target: str, fixed: str, *, out_of_range: OutOfRange = "raise") -> PointCloud:
+    def deskew(
+        self,
+        cloud: PointCloud,
+        target: str,
+        fixed: str,
+        *,
+        out_of_range: OutOfRange = "raise",
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> PointCloud:
         """A cloud from a moving sensor, corrected as if all points had been seen at the stamp of the cloud.
 
         Each point is moved into `fixed` by the transform at its own stamp, and from there into `target` by the
@@ -407,6 +421,8 @@ class TransformTree:
         out_of_range : {"raise", "nan"}
             As for `lookup_many`; points without an answer become NaN. The stamp of the cloud itself must have an
             answer.
+        tolerance, max_gap, extrapolate
+            As `lookup`.
 
         Returns
         -------
@@ -419,8 +435,11 @@ class TransformTree:
             As for `lookup_many`.
         ValueError
             If the points have no stamps.
+        TypeError
+            If `cloud` is no `PointCloud`: ``to_points`` makes one of a `LaserScan`.
         """
-        return deskew(self._forest, cloud, target, fixed, out_of_range)
+        policy = policy_of(tolerance, max_gap, extrapolate)
+        return deskew(self._forest, cloud, target, fixed, out_of_range, policy)
 
     def twist(
         self, frame: str, reference: str, at: AtLike = LATEST, *, expressed_in: str | None = None
@@ -672,10 +691,14 @@ def window_of(keep: float | None) -> int | None:
     Raises
     ------
     ValueError
-        If `keep` is negative or NaN.
+        If `keep` is negative or NaN, or does not fit 64-bit nanoseconds.
     """
     seconds = None if keep is None else as_duration(keep, "keep")
-    return None if seconds is None or seconds == math.inf else from_seconds(seconds)
+    if seconds is None or seconds == math.inf:
+        return None
+    if seconds > STAMP_MAX / SECOND:
+        raise ValueError(f"keep must be at most 292 years, in s, got {keep!r}: nanoseconds passed as seconds?")
+    return from_seconds(seconds)
 
 
 def _as_many(source_at: StampLike | StampsLike, count: int) -> Stamps:

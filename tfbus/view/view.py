@@ -32,6 +32,7 @@ from tfbus.errors import BusClosedError
 from tfbus.events import FrameAdded
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import Batch
+from tfbus.registration import AsyncOnly
 from tfbus.robot.model import read_visuals
 from tfbus.stamps import as_duration, is_real
 from tfbus.statistics import QueueStatistics
@@ -48,7 +49,7 @@ _AT_LEAST_EVERY = 0.5
 """In s: the longest time between two pictures, because ages and stale frames change without any sample."""
 
 
-class View:
+class View(AsyncOnly):
     """A page in the browser that shows the frames of a buffer: ``async with View(bus, buffer) as view``.
 
     It shows the axes of every frame that is connected with the fixed frame, and a line to its parent in the colour of

@@ -9,13 +9,12 @@ import termios
 import time
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import anyio
 import pytest
-from support.commands import Command, Done, Terminal, nobody
+from support.commands import Command, Done, nobody
 from support.processes import PATIENCE, TFBUS, free_address, new_domain, start_tfbus, until
 from support.recorded import SMALL, WRONG_IN_SMALL, messages_in, write_mcap
 from support.rosbridge import rosbridge_server
@@ -202,69 +201,6 @@ async def test_keys_pause_and_change_the_rate_in_steps(keys: str, rate: float, a
     assert player.paused is paused
 
 
-def heard(received: Sequence[object], count: int) -> bool:
-    return len(received) == count
-
-
-@contextmanager
-def typewriter(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
-    """A terminal as standard input, in whose foreground this process runs; gives its two ends."""
-    ours, theirs = pty.openpty()
-    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
-    with os.fdopen(theirs, encoding="utf-8") as terminal:
-        monkeypatch.setattr(sys, "stdin", terminal)
-        yield ours, theirs
-    os.close(ours)
-
-
-@pytest.mark.parametrize("screen", [False, True])
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_keys_steer_the_player_until_a_termination_and_the_terminal_is_as_before(
-    tfbus: Command, hour: Path, monkeypatch: pytest.MonkeyPatch, backend: str, screen: bool
-) -> None:
-    shown = Terminal()
-    if screen:
-        monkeypatch.setattr(sys, "stderr", shown)
-        monkeypatch.setenv("TERM", "xterm")
-    with typewriter(monkeypatch) as (ours, theirs):
-        before = termios.tcgetattr(theirs)
-        raw = before[3] & ~(termios.ICANON | termios.ECHO)
-        while_stopped: list[object] = []
-        kill = os.kill
-
-        def stop_or_kill(process: int, number: int) -> None:
-            if number == signal.SIGSTOP:
-                while_stopped.append(termios.tcgetattr(theirs))
-            else:
-                kill(process, number)
-
-        monkeypatch.setattr(os, "kill", stop_or_kill)
-
-        async def type_keys(received: list[TransformStamped]) -> None:
-            for count, keys in enumerate((b" +s", b"\x1b[C"), 1):
-                await until(partial(heard, received, count))
-                os.write(ours, keys)
-            await until(partial(heard, received, 3))
-            # The bar is drawn ten times a second.
-            await until(lambda: not screen or "paused at 2 x" in shown.getvalue())
-            os.kill(os.getpid(), signal.SIGTSTP)
-            await until(lambda: len(while_stopped) == 1)
-            await until(lambda: termios.tcgetattr(theirs)[3] == raw)
-            os.kill(os.getpid(), signal.SIGTERM)
-            await anyio.sleep_forever()
-
-        done, _ = play(tfbus, hour, "--backend", backend, then=type_keys)
-        assert [*while_stopped, termios.tcgetattr(theirs)] == [before, before]
-    lines = (shown.getvalue() if screen else done.stderr).splitlines()
-    assert done.returncode == 128 + signal.SIGTERM
-    assert any(line.startswith("space pauses, s or the right arrow plays the next message") for line in lines)
-    assert "3 samples in 3 messages played in " in lines[-1]
-    if screen:
-        assert "50%" in shown.getvalue()
-    else:
-        assert lines[2:-1][:3] == ["paused", "paused at 2 x", "paused at 2 x"]
-
-
 def test_a_loop_counts_its_passes(tfbus: Command, ten_seconds: Path) -> None:
     async def three_times(received: list[TransformStamped]) -> None:
         await until(lambda: sum(sample.static for sample in received) >= 3)
@@ -275,7 +211,10 @@ def test_a_loop_counts_its_passes(tfbus: Command, ten_seconds: Path) -> None:
 
 
 def test_there_is_no_keyboard_but_a_terminal_in_whose_foreground_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    with typewriter(monkeypatch) as (_, theirs):
+    ours, theirs = pty.openpty()
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
+    with os.fdopen(ours), os.fdopen(theirs, encoding="utf-8") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
         assert keyboard() is not None
         monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
         assert keyboard() is None
@@ -338,11 +277,14 @@ class Session:
 
 
 @contextmanager
-def session(path: Path, *options: str) -> Iterator[Session]:
+def session(path: Path, *options: str, errors: Path | None = None) -> Iterator[Session]:
+    """With `errors`, standard error is that file and no terminal."""
     process, terminal = pty.fork()
     if process == 0:
         with suppress(BaseException):
             signal.signal(signal.SIGINT, signal.default_int_handler)
+            if errors is not None:
+                os.dup2(os.open(errors, os.O_WRONLY | os.O_CREAT), 2)
             os.execve(TFBUS, [TFBUS, "play", str(path), *options], {**os.environ, "TERM": "xterm"})
         os._exit(1)
     try:
@@ -354,14 +296,13 @@ def session(path: Path, *options: str) -> Iterator[Session]:
         os.close(terminal)
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("options", "last", "status"),
     [
         ("", b" s", 0),
-        ("--clock", b"\x03", 130),
-        ("--backend trio", b"\x03", 130),
-        ("--clock --backend trio", None, 143),
+        pytest.param("--clock", b"\x03", 130, marks=pytest.mark.thorough),
+        pytest.param("--backend trio", b"\x03", 130, marks=pytest.mark.thorough),
+        pytest.param("--clock --backend trio", None, 143, marks=pytest.mark.thorough),
     ],
 )
 def test_keys_steer_it_on_a_terminal_which_is_as_before_while_it_is_stopped_and_after_every_end(
@@ -388,3 +329,14 @@ def test_keys_steer_it_on_a_terminal_which_is_as_before_while_it_is_stopped_and_
         play.expect("samples in ")
         play.expect("messages played")
         assert os.waitstatus_to_exitcode(play.wait()) == status
+
+
+def test_where_standard_error_is_no_terminal_each_key_tells_the_state_in_a_line(hour: Path, tmp_path: Path) -> None:
+    told = tmp_path / "told"
+    with session(hour, "--domain", new_domain(), errors=told) as play:
+        play.wait_until_raw()
+        os.write(play.terminal, b" +s")
+        play.wait_until(lambda: told.read_text().count("at 2 x\n") == 2)
+        os.kill(play.process, signal.SIGTERM)
+        assert os.waitstatus_to_exitcode(play.wait()) == 128 + signal.SIGTERM
+    assert told.read_text().splitlines()[2:-1] == ["paused", "paused at 2 x", "paused at 2 x"]

@@ -293,7 +293,7 @@ anyio.run(main)
 @pytest.mark.thorough
 def test_two_links_of_a_process_and_another_program_do_not_wait_for_each_other_for_ever(domain_number: int) -> None:
     with cyclone_node(domain_number):
-        command = [sys.executable, "-c", TWO_LINKS, f"{domain_number}"]
+        command = [sys.executable, "-P", "-c", TWO_LINKS, f"{domain_number}"]
         # They would keep the interpreter lock: only another process can tell.
         done = subprocess.run(command, timeout=60.0, capture_output=True, text=True, env=os.environ, check=False)
     assert (done.returncode, done.stderr) == (0, "")

@@ -212,7 +212,7 @@ async def test_silence_for_longer_than_the_lease_is_healed(who: str, address: st
         if who == "the router":
             stop.add(start_router(address))
         else:
-            stop.add(Program(sys.executable, "-c", _LINK, domain, *next(iter(routing.items()))))
+            stop.add(Program(sys.executable, "-P", "-c", _LINK, domain, *next(iter(routing.items()))))
         async with AsyncExitStack() as stack:
             if who == "a link":
                 await stack.enter_async_context(ZenohRouter(address))

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.anyio
 
 async def test_without_zenoh_the_import_names_the_extra() -> None:
     program = "import sys; sys.modules['zenoh'] = None; import tfbus.links.zenoh"
-    with Program(sys.executable, "-c", program) as done:
+    with Program(sys.executable, "-P", "-c", program) as done:
         assert done.wait() == 1
         assert done.errors.text.splitlines()[-1].endswith(f"one more package: {pip_install('zenoh')}")
 

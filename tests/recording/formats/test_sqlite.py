@@ -219,7 +219,7 @@ def killed_writer(path: Path, mode: str) -> None:
         "os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     write(path)
-    subprocess.run([sys.executable, "-c", program, str(path), mode], check=False)
+    subprocess.run([sys.executable, "-P", "-c", program, str(path), mode], check=False)
 
 
 @pytest.mark.parametrize(("mode", "journal"), [("DELETE", "-journal"), ("WAL", "-wal")])

@@ -3,10 +3,13 @@
 import json
 import math
 from collections.abc import Callable, Iterable
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError
+from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError, is_number
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups, ReplayClock
 from tfbus.cli.output import cells, format_seconds, print_now, say, terminal_width, wrapped
 from tfbus.clock import Clock, SystemClock
@@ -26,7 +29,7 @@ def echo(
     target: str,
     source: str,
     /,
-    *,
+    *further: Annotated[str, Parameter(show=False)],
     rate: Rate = 1.0,
     max_age: Duration = math.inf,
     as_json: JsonFlag = False,
@@ -56,6 +59,9 @@ def echo(
     remote
         Ask the buffer that a program of the robot in --robots offers to others, instead of receiving all transforms.
     """
+    if further:
+        habit = f"tf2_echo's rate is an option: type tfbus echo {target} {source} --rate {further[0]}"
+        raise UsageError(habit if is_number(further[0]) else f"expected TARGET and SOURCE, not {further[0]!r} as well")
     try:
         for frame in (target, source):
             check_frame(frame)

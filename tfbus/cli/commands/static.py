@@ -9,7 +9,7 @@ import anyio
 from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import UsageError
+from tfbus.cli.arguments import UsageError, is_number
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, publish_static
 from tfbus.cli.output import format_numbers, format_transform, say, warn
 from tfbus.errors import InvalidTransformError
@@ -86,7 +86,7 @@ def _check_habits(words: Sequence[str]) -> None:
     """Raise an error with the right form, if the words are arguments of tf2's static_transform_publisher."""
     if len(words) <= 2:
         return
-    count = next((at for at, word in enumerate(words) if not _is_number(word)), len(words))
+    count = next((at for at, word in enumerate(words) if not is_number(word)), len(words))
     frames = words[count : count + 2]
     if count not in (6, 7) or len(frames) < 2:
         raise UsageError(f"expected PARENT and CHILD, or a file, but there is {words[2]!r} as well")
@@ -97,14 +97,6 @@ def _check_habits(words: Sequence[str]) -> None:
         f"tf2's order of arguments is another one: type tfbus static {' '.join(frames)} "
         f"--xyz {' '.join(numbers[:3])} {rotation}"
     )
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _from_file(file: Path, authority: str) -> list[TransformStamped]:

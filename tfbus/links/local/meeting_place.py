@@ -1,9 +1,10 @@
 """`MeetingPlace`: how the links of one domain find each other in a directory of the user.
 
-The folder of a domain has one file for each of its links: a Unix socket, or, with `loopback`, a text with the port of
-the loopback at which the link listens and a key. Its name is the time of the link's opening and a part of its id, so
-that any two links agree about which is the younger. A name becomes visible once the link listens, by a rename. So a
-file without a listener belongs to a process that was killed, and the first link that finds the file removes it.
+The directory has one file for each link: a Unix socket, or, with `loopback`, a text with the port of the loopback at
+which the link listens and a key. The name of a file is a hash of the domain, the time of the link's opening and a part
+of its id, so any two links agree about which is the younger. A file without a listener belongs to a process that was
+killed, and the first link that finds the file removes it. If that link came between the two steps of a beginning, the
+owner finds its name missing at its next look, and shows it again, as after any other loss of the file.
 
 The directory is the one that was given, or named by ``TFBUS_RUNTIME_DIR``, or else ``tfbus`` in ``XDG_RUNTIME_DIR``, or
 else ``tfbus-UID`` in the directory for temporary files. It belongs to the user and is closed to all others, which is
@@ -24,17 +25,12 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Final
 
-from tfbus.stamps import SECOND
+from tfbus.links.local.connection import KEY
 
 BACKLOG: Final = 1024
 LONGEST_PATH: Final = 100
 """Bytes; systems have room for 104 to 108 in the address of a Unix socket."""
-SETTLED: Final = SECOND // 10
-"""ns; the time of a folder's last change is only as fine as the ticks of the system, so two changes may share one."""
-FORGOTTEN: Final = 60 * SECOND
-"""ns after which a file that was never made visible belongs to a process that was killed."""
 SEND_BUFFER: Final = 2**18
-_NAME = re.compile(r"\.?([0-9a-f]{16})[0-9a-f]{8}")
 _OTHERWISE = "or set TFBUS_RUNTIME_DIR to a directory of your own"
 
 
@@ -48,42 +44,38 @@ def runtime_directory() -> Path:
     return Path(tempfile.gettempdir(), name)
 
 
-def make_private(directory: Path, *, parents: bool) -> None:
+def make_private(directory: Path) -> None:
     """Make a directory that only its user can enter.
-
-    Parameters
-    ----------
-    directory : Path
-    parents : bool
-        Whether to make the directories above it too, which others may be able to enter.
 
     Raises
     ------
     PermissionError
         If it is another user's, or others can enter it, or it cannot be made.
     FileNotFoundError
-        If it has vanished again, or the directory above it is not there and need not be made.
+        If it has vanished again.
     """
     try:
-        directory.mkdir(mode=0o700, parents=parents, exist_ok=True)
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = directory.lstat()
     except (PermissionError, FileExistsError, NotADirectoryError) as error:
-        problem = f"{directory} cannot be made a directory ({error.strerror}): make it one with mode 700, {_OTHERWISE}"
-        raise PermissionError(problem) from error
+        problem = f"cannot be made a directory ({error.strerror}): make it one with mode 700"
+        raise PermissionError(f"{directory} {problem}, {_OTHERWISE}") from error
     if not hasattr(os, "geteuid"):
         return
     if not stat.S_ISDIR(found.st_mode):
-        raise PermissionError(f"{directory} is no directory: remove it, {_OTHERWISE}")
-    if found.st_uid != os.geteuid():
-        owner = f"belongs to the user {found.st_uid}, and this process is of {os.geteuid()}"
-        raise PermissionError(f"{directory} {owner}: remove it, {_OTHERWISE}")
-    if found.st_mode & 0o077:
-        mode = f"has the mode {stat.S_IMODE(found.st_mode):o}, so other users can enter it"
-        raise PermissionError(f"{directory} {mode}: run chmod 700 {directory}, {_OTHERWISE}")
+        problem = "is no directory: remove it"
+    elif found.st_uid != os.geteuid():
+        problem = f"belongs to the user {found.st_uid}, and this process is of {os.geteuid()}: remove it"
+    elif found.st_mode & 0o077:
+        mode = stat.S_IMODE(found.st_mode)
+        problem = f"has the mode {mode:o}, so other users can enter it: run chmod 700 {directory}"
+    else:
+        return
+    raise PermissionError(f"{directory} {problem}, {_OTHERWISE}")
 
 
 class MeetingPlace:
-    """The folder of one domain, and the file of one link in it.
+    """The files of one domain, and the one of a link among them.
 
     Parameters
     ----------
@@ -100,19 +92,17 @@ class MeetingPlace:
     name : str
         The name of the link's file; empty unless it is open. A younger link has a greater one.
     key : bytes
-        Known to those who may read the file; empty for Unix sockets, where the kernel tells who connects.
+        Known to those who may read the file; zeros for Unix sockets, where the kernel tells who connects.
     """
 
     def __init__(self, domain: str, link: str, directory: str | None, loopback: bool) -> None:
-        self._root = runtime_directory() if directory is None else Path(directory)
+        self._directory = runtime_directory() if directory is None else Path(directory)
         kind = "loopback" if loopback else "unix"
-        self._folder = self._root / blake2b(f"{kind} {domain}".encode(), digest_size=6).hexdigest()
+        self._domain = blake2b(f"{kind} {domain}".encode(), digest_size=6).hexdigest()
         self._link = link
-        self._loopback = loopback
+        self.loopback = loopback
         self.name = ""
-        self.key = secrets.token_bytes(32) if loopback else b""
-        self._changed = 0
-        self._others: list[str] = []
+        self.key = bytes(KEY)
 
     def open(self) -> socket.socket:
         """Listen, and show the link's name; also again, when the name has vanished.
@@ -124,105 +114,79 @@ class MeetingPlace:
         OSError
             If it is not possible to listen.
         """
-        self.name = self.name or f"{time.time_ns():016x}{self._link[:8]}"
-        for attempts_left in (2, 1, 0):
-            try:
-                make_private(self._root, parents=True)
-                make_private(self._folder, parents=False)
-                return self._listen(self._folder / f".{self.name}")
-            except FileNotFoundError:
-                # The last link that left has removed the folder meanwhile, or somebody has removed all.
-                if not attempts_left:
-                    raise
-        raise AssertionError
+        self.name = self.name or f"{self._domain}-{time.time_ns():016x}{self._link[:8]}"
+        with suppress(FileNotFoundError):
+            return self._listen()
+        # Somebody has removed the directory meanwhile.
+        return self._listen()
 
-    def _listen(self, hidden: Path) -> socket.socket:
-        if not self._loopback and len(os.fsencode(hidden)) > LONGEST_PATH:
-            problem = (
-                f"the path of a socket would be too long: set TFBUS_RUNTIME_DIR to a path shorter than {self._root}"
-            )
-            raise OSError(errno.ENAMETOOLONG, problem)
-        hidden.unlink(missing_ok=True)
-        listener = socket.socket(socket.AF_INET if self._loopback else socket.AF_UNIX)
+    def _listen(self) -> socket.socket:
+        make_private(self._directory)
+        path = self._directory / self.name
+        if not self.loopback and len(os.fsencode(path)) > LONGEST_PATH:
+            shorter = f"set TFBUS_RUNTIME_DIR to a path shorter than {self._directory}"
+            raise OSError(errno.ENAMETOOLONG, f"the path of a socket would be too long: {shorter}")
+        listener = self._socket()
         try:
-            listener.setblocking(False)
-            if self._loopback:
-                listener.bind(("127.0.0.1", 0))
-                with os.fdopen(os.open(hidden, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w") as file:
-                    file.write(f"{listener.getsockname()[1]} {self.key.hex()}")
-            else:
-                listener.bind(str(hidden))
-                hidden.chmod(0o600)
+            listener.bind(("127.0.0.1", 0) if self.loopback else str(path))
             listener.listen(BACKLOG)
-            hidden.replace(self._folder / self.name)
+            if self.loopback:
+                # Another program may have the port of before, and know the key that was said there.
+                self.key = secrets.token_bytes(KEY)
+                with os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w") as file:
+                    file.write(f"{listener.getsockname()[1]} {self.key.hex()}")
         except OSError:
             listener.close()
-            with suppress(OSError):
-                hidden.unlink()
             raise
-        self._changed = 0
         return listener
 
+    def _socket(self) -> socket.socket:
+        sock = socket.socket(socket.AF_INET if self.loopback else socket.AF_UNIX)
+        sock.setblocking(False)
+        return sock
+
     def others(self) -> list[str]:
-        """The names of the other links; a single question to the system if none has changed.
+        """The names of the other links.
 
         Raises
         ------
         FileNotFoundError
             If the link's own name has vanished.
         """
-        changed = self._folder.stat().st_mtime_ns
-        if changed != self._changed:
-            now = time.time_ns()
-            names = [path.name for path in self._folder.iterdir()]
-            if self.name not in names:
-                raise FileNotFoundError(errno.ENOENT, "the link's name has vanished", str(self._folder / self.name))
-            self._others = [name for name in names if name != self.name and _NAME.fullmatch(name) and name[0] != "."]
-            for name in names:
-                if name[0] == "." and (found := _NAME.fullmatch(name)) and int(found[1], 16) < now - FORGOTTEN:
-                    self.remove(name)
-            self._changed = changed if now - changed > SETTLED else 0
-        return self._others
+        names = [path.name for path in self._directory.iterdir()]
+        if self.name not in names:
+            raise FileNotFoundError(errno.ENOENT, "the link's name has vanished", str(self._directory / self.name))
+        of_link = re.compile(f"{self._domain}-[0-9a-f]{{24}}").fullmatch
+        return [name for name in names if name != self.name and of_link(name)]
 
-    def dial(self, name: str) -> tuple[socket.socket, bytes, bool]:
-        """Connect to a link without waiting.
+    def dial(self, name: str) -> tuple[socket.socket, bytes]:
+        """Connect to a link without waiting; returns the socket and the key.
 
-        Returns
-        -------
-        socket
-        key : bytes
-        connected : bool
-            Whether the connection is there; else the socket has room as soon as it is.
+        A port of the loopback may be connected later; the socket has room as soon as it is.
 
         Raises
         ------
         OSError
             If the link is not there or has no room. If its file has no listener, the file is removed.
         """
-        path = self._folder / name
-        key, connected = b"", True
-        sock = socket.socket(socket.AF_INET if self._loopback else socket.AF_UNIX)
+        path, key = self._directory / name, self.key
+        sock = self._socket()
         try:
-            sock.setblocking(False)
-            if self._loopback:
+            if self.loopback:
                 port, _, digits = path.read_text().partition(" ")
                 key = bytes.fromhex(digits)
-                try:
+                with suppress(BlockingIOError):
                     sock.connect(("127.0.0.1", int(port)))
-                except BlockingIOError:
-                    connected = False
             else:
                 sock.connect(str(path))
             self.prepare(sock)
-        except OSError as error:
+        except (OSError, ValueError) as error:
             sock.close()
-            if isinstance(error, ConnectionRefusedError):
-                self.remove(name)
-            raise
-        except ValueError as error:
-            sock.close()
-            raise OSError(f"{path} has no port and key") from error
-        return sock, key, connected
+            if isinstance(error, OSError) and not isinstance(error, ConnectionRefusedError):
+                raise
+            self.remove(name)
+            raise ConnectionRefusedError(f"nobody listens for {path}") from error
+        return sock, key
 
     def prepare(self, sock: socket.socket) -> None:
         """Make the socket of a new connection ready for use.
@@ -233,7 +197,7 @@ class MeetingPlace:
             If a process of another user has the other end.
         """
         sock.setblocking(False)
-        if self._loopback:
+        if self.loopback:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
@@ -245,12 +209,10 @@ class MeetingPlace:
     def remove(self, name: str) -> None:
         """Remove the file of a link that is not there."""
         with suppress(OSError):
-            (self._folder / name).unlink()
+            (self._directory / name).unlink()
 
     def close(self) -> None:
-        """Remove the link's own file, and the folder with the last one."""
+        """Remove the link's own file."""
         if self.name:
             self.remove(self.name)
             self.name = ""
-            with suppress(OSError):
-                self._folder.rmdir()

@@ -20,13 +20,13 @@ from tfbus.links.zenoh.sessions import (
     os_error,
     router_config,
 )
-from tfbus.registration import warn_unless_entered
+from tfbus.registration import AsyncOnly, warn_unless_entered
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
 """The address of a router that is given none: only processes of this machine reach it."""
 
 
-class ZenohRouter:
+class ZenohRouter(AsyncOnly):
     """Passes on what links send each other: ``async with ZenohRouter("tcp/192.168.1.5:7447")``.
 
     It has no bus, knows no domains, and passes on only what a link behind it, or behind another router, has subscribed
