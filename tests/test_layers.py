@@ -23,6 +23,7 @@ GROUND = (
     "statistics",
     "rows",
     "_python_kernel",
+    "running_kernel",
     "which_kernel",
     "clock",
     "_aio",

@@ -4,8 +4,6 @@ A `Bus` broadcasts transforms to its buffers; a `Buffer` keeps a few seconds of 
 seen from another, and lets a lookup wait for data that are still on their way. Works on asyncio and trio, without ROS.
 """
 
-from importlib import import_module
-
 __version__ = "0.1.0"
 
 _NAMES_IN = {
@@ -108,6 +106,8 @@ __all__ = sorted(_HOMES)
 
 def __getattr__(name: str) -> object:
     # A module is loaded when one of its names is used first: numpy alone takes longer than a command that prints help.
+    from importlib import import_module
+
     if name in _HOMES:
         value = getattr(import_module(f"tfbus.{_HOMES[name]}"), name)
     elif name in _ROOMS:

@@ -46,7 +46,7 @@ class Command:
     def __call__(self, *arguments: object) -> Done:
         """Run the command to its end."""
         # Loaded here, where the test is skipped if the extra is not installed.
-        from tfbus.cli.application import run
+        from tfbus.cli import run
 
         try:
             status = run(list(map(str, arguments)))

@@ -1,22 +1,16 @@
-"""The command line: the subcommands, their common options, and the exit status.
+"""The command line: the subcommands, and their common options.
 
-`run` parses the words with cyclopts, and loads the module of the one subcommand that they name. The help of all and the
-version are printed without cyclopts, which takes several times as long to load. A subcommand returns its exit status,
-or None for success. For a fault that a user can cause, it raises `UsageError`, a `RecordingError` or a
-`TransformLookupError`, and `run` prints a line for each.
+`parser_of` parses the words with cyclopts, and loads the module of the one subcommand that they name.
 """
 
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from io import TextIOWrapper
 from typing import Annotated, Any, Final, Literal, get_args
 
+from tfbus.cli.statuses import USAGE_ERROR
+from tfbus.cli.version import version
 from tfbus.tf2_names import ours
-
-FAILED, USAGE_ERROR, INTERRUPTED, ENDED_BY_SIGNAL = 1, 2, 130, 128
-"""The exit statuses; the number of a signal is added to the last one."""
 
 COMMANDS = {
     "bridge": "Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.",
@@ -65,49 +59,33 @@ _DEFAULT_LEVEL: Final = "warning"
 _Program = Callable[[], int | None]
 
 
-def run(words: Sequence[str], loaded: Callable[[], object] = lambda: None) -> int:
-    """Run the command with arguments, and return its exit status.
-
-    Parameters
-    ----------
-    words : sequence of str
-        The words that a user types after ``tfbus``.
-    loaded : callable
-        Called once all modules of the subcommand are there, before it begins.
-    """
-    if isinstance(sys.stdout, TextIOWrapper):
-        # Its encoding may lack the letters of a frame name.
-        sys.stdout.reconfigure(errors="backslashreplace")
+def parser_of(words: Sequence[str]) -> Callable[[], _Program | None]:
+    """A function that parses the words after ``tfbus`` and gives their program, or None if it has printed some help."""
+    if list(words) in ([], ["-h"], ["--help"]):
+        return _print_overview
     # `info` is a level of the log, too.
     named = (word for before, word in zip(("", *words), words, strict=False) if before != "--log-level")
     plain = [word for word in named if not word.startswith("-")]
     command = next((word for word in plain if word in COMMANDS), None)
     if command is None and plain and (hint := ours("command", plain[0])):
-        print(f"tfbus: there is no command {plain[0]!r}: {hint}", file=sys.stderr)
-        return USAGE_ERROR
-    app = None if tuple(words) in _PAGES else application(command)
-    status = 0
-    try:
-        if app is None:
-            print(_PAGES[tuple(words)](), flush=True)
-            return status
+        return lambda: partial(_refuse, plain[0], hint)
+    app = application(command)
+
+    def parse() -> _Program | None:
         prepare, arguments, _ = app.meta.parse_args(words, exit_on_error=False, print_error=False)
-        program = prepare(*arguments.args, **arguments.kwargs)
-        # Help has been printed by now.
-        if program is not None:
-            loaded()
-            status = program() or 0
-        sys.stdout.flush()
-    except* KeyboardInterrupt:
-        status = INTERRUPTED
-    except* BrokenPipeError:
-        # The reader has closed the pipe; without this, Python would report that again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except* _usage_errors() as errors:
-        status = _report(errors, USAGE_ERROR)
-    except* _lookup_errors() as errors:
-        status = _report(errors, FAILED)
-    return status
+        program: _Program | None = prepare(*arguments.args, **arguments.kwargs)
+        return program
+
+    return parse
+
+
+def _refuse(command: str, hint: str) -> int:
+    print(f"tfbus: there is no command {command!r}: {hint}", file=sys.stderr)
+    return USAGE_ERROR
+
+
+def _print_overview() -> None:
+    print(_overview())
 
 
 def _overview() -> str:
@@ -173,7 +151,7 @@ def application(command: str | None) -> Any:
     app = App(
         name="tfbus",
         help=_SUMMARY,
-        version=_version,
+        version=version,
         help_epilogue=_EXIT_STATUSES,
         # Loading a parser of Markdown takes as long as everything else for the list of commands.
         help_format="plaintext" if command is None else "markdown",
@@ -206,45 +184,8 @@ def _shown_default(default: object) -> str | None:
     return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
 
 
-# The modules below are loaded where they are used, because the help and the version need few of them.
-
-
-def _version() -> str:
-    from tfbus import __version__
-    from tfbus.which_kernel import kernel
-
-    return f"{__version__} ({kernel} kernel)"
-
-
-_PAGES: Final = dict.fromkeys([(), ("-h",), ("--help",)], _overview) | {("--version",): _version}
-"""The pages that need no cyclopts, by the words that ask for them."""
-
-
 def _run_logging(level: _LogLevel, program: _Program) -> int | None:
     from tfbus.cli.output import log_lines
 
     with log_lines(level.upper()):
         return program()
-
-
-def _report(errors: BaseExceptionGroup[BaseException], status: int) -> int:
-    from tfbus.cli.output import warn
-
-    for error in errors.exceptions:
-        warn(str(error))
-    return status
-
-
-def _usage_errors() -> tuple[type[Exception], ...]:
-    from cyclopts import CycloptsError
-
-    from tfbus.cli.arguments import UsageError
-    from tfbus.errors import RecordingError
-
-    return CycloptsError, UsageError, RecordingError
-
-
-def _lookup_errors() -> type[Exception]:
-    from tfbus.errors import TransformLookupError
-
-    return TransformLookupError

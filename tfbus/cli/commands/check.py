@@ -10,7 +10,6 @@ from cyclopts import Parameter
 
 from tfbus.analysis.examiner import Examiner, Finding, Limits
 from tfbus.bus.bus import Bus
-from tfbus.cli.application import FAILED
 from tfbus.cli.arguments import (
     Duration,
     Instant,
@@ -21,6 +20,7 @@ from tfbus.cli.arguments import (
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import fitted, progress, say, warn
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions
+from tfbus.cli.statuses import FAILED
 from tfbus.geometry.stamped import Batch
 from tfbus.recording.examine import examine
 

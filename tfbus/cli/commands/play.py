@@ -14,11 +14,11 @@ import anyio
 from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
-from tfbus.cli.application import ENDED_BY_SIGNAL
 from tfbus.cli.arguments import Flag, Instant, Speed, Time, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_counts, progress_bar, say, warn
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions
+from tfbus.cli.statuses import ENDED_BY_SIGNAL
 from tfbus.clock import SimulatedClock
 from tfbus.events import PeerJoined
 from tfbus.recording.player import Player

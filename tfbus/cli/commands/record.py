@@ -12,10 +12,10 @@ import anyio
 
 from tfbus.bus.bus import Bus
 from tfbus.bus.event_stream import EventStream
-from tfbus.cli.application import ENDED_BY_SIGNAL, FAILED
 from tfbus.cli.arguments import Duration, Flag, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_counts, say, warn
+from tfbus.cli.statuses import ENDED_BY_SIGNAL, FAILED
 from tfbus.events import RecordingDropped, RecordingFailed
 from tfbus.recording.recorder import Recorder
 from tfbus.statistics import RecorderStatistics
