@@ -77,10 +77,10 @@ def lookup_cycle(package: Any, edges: int, timeout: float | None) -> AsyncTurn:
         lagging = samples_of(package, frames[-1], CYCLES + 1, parent=frames[-2])
         bus.publish(lagging[0])
         stamps = [sample.stamp for sample in lagging[1:]]
-        options = {} if timeout is None else {"timeout": timeout}
         lookup, source = buffer.lookup, frames[-1]
         return await cycle(
-            lambda place: lookup(BASE, source, stamps[place], **options), lambda place: bus.publish(lagging[place + 1])
+            lambda place: lookup(BASE, source, stamps[place], timeout=timeout),
+            lambda place: bus.publish(lagging[place + 1]),
         )
 
     return turn

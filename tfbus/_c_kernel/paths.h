@@ -4,6 +4,8 @@
  * edges are one row. `chain_at` answers at one stamp; a Held is a look at the samples of all edges at one moment, and
  * answers at many stamps, in columns of LANES rows, without the interpreter's lock.
  *
+ * Each edge remembers its row at the stamp between two samples that was asked for last, until samples change around it.
+ *
  * Paths is the cache {target: {source: Chain}} of a tree with its lock. It answers where a chain is known, covers the
  * stamp, and nobody holds the lock; else Python looks closer: it finds the chain, applies the policy or words the error.
  * Python clears the cache whenever a chain might not hold any more.

@@ -5,10 +5,10 @@ Each lookup passes a checkpoint, asks the tree, and if the answer may still come
 answer. The task gives that answer if the tree has not changed until it runs, one turn of the event loop later;
 otherwise it asks again, and may park again on the same deadline.
 
-The kernel does all this for a plain lookup that lacks nothing but newer samples. It calls `Lookups.begin` for the
-sleep, because the event loop and the clock are Python's, and gives None where something is not plain. `Lookups.go_on`
-is the whole wait in Python. It goes on from there, and it is the only way without the compiled kernel, with a prefix,
-with options, and on a clock that is not a class of tfbus.
+The kernel does all this for a plain lookup that lacks nothing but newer samples, and parks it at once: the sleep is its
+checkpoint. It calls `Lookups.begin` for the first sleep on an event loop, makes the later ones itself, and gives None
+where something is not plain. `Lookups.go_on` is the whole wait in Python. It goes on from there, and it is the only way
+without the compiled kernel, with a prefix, with options, and on a clock that is not a class of tfbus.
 
 An alarm ends a wait at its timeout. A cancel scope for each wait would set and remove a timer of the event loop each
 time; the alarms of a buffer share one timer. The timer is set for the first alarm. When that alarm is cancelled, the
