@@ -62,6 +62,8 @@ nitpick_ignore_regex = [
     ("py:class", r"tfbus\..*\.MalformedMessageError"),
     # The parts of a recording for code that reads it in blocks.
     ("py:class", r"tfbus\.recording\.(recording\.(Decoded)?Block|formats\.\w+\.RawTransform)"),
+    # An object with a tree, such as a buffer, whose static frames are saved.
+    ("py:class", r"tfbus\.recording\.static_frames\.HasTree"),
     # The policy of a question that waits, which a program reads from it and never makes.
     ("py:class", r"tfbus\.tree\.lookup\.Policy"),
     # The parts of a link, and the follower of a clock.
