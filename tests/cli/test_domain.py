@@ -17,7 +17,7 @@ import pytest
 from support.asking import settle
 from support.both_sides import URDF
 from support.commands import START, Command, check_wrong_call
-from support.processes import PATIENCE, new_domain, start_tfbus
+from support.processes import PATIENCE, new_dds_domain, new_domain, start_tfbus
 from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, ClockResetError, LocalLink, SimulatedClock, TransformStamped, from_seconds
@@ -318,6 +318,33 @@ def test_what_is_no_place_of_ros_is_a_usage_error(place: str, why: str) -> None:
         pytest.importorskip(extra)
     with pytest.raises(UsageError, match=why):
         ros_link(Bus(), place)
+
+
+def test_the_topics_and_the_prefix_of_a_robot_in_a_namespace_are_given_to_every_place() -> None:
+    pytest.importorskip("cyclonedds")
+    from support.dds import DdsNode
+
+    domain_number = new_dds_domain()
+    options = LinkOptions(ros=(f"dds:{domain_number}",), tf=("/robot1/tf",), tf_prefix="robot1/")
+
+    async def hear(bus: Bus) -> set[str]:
+        with Buffer(bus) as buffer, DdsNode(domain_number) as node:
+            node.say(static("base", "laser"), topic="rt/robot1/tf_static")
+            node.writer("rt/robot1/tf")
+            await buffer.lookup("robot1/base", "robot1/laser", timeout=PATIENCE)
+            # The moving ones are not latched.
+            while not buffer.can_transform("robot1/map", "robot1/base"):
+                node.say(moving("map", "base", SECOND), topic="rt/robot1/tf")
+                node.say(moving("map", "other", SECOND), topic="rt/tf")
+                await anyio.sleep(0.02)
+            return set(buffer.tree.frames())
+
+    assert options.run(hear) == {"robot1/map", "robot1/base", "robot1/laser"}
+    for wrong in (LinkOptions(tf=("/a/tf",)), LinkOptions(tf_prefix="a/")):
+        with pytest.raises(UsageError, match="--tf and --tf-prefix are for ROS"):
+            join(wrong)
+    with pytest.raises(UsageError, match="cannot be the name of a topic"):
+        join(replace(options, tf=("/a b/tf",)))
 
 
 @pytest.mark.thorough

@@ -91,6 +91,8 @@ def test_roll_pitch_and_yaw_are_the_fixed_axes_of_transforms3d(xyz: Vector, rpy:
     t = Transform.from_xyz_rpy(xyz, rpy)
     np.testing.assert_allclose(t.matrix()[:3, :3], euler.euler2mat(*rpy, "sxyz"), rtol=0, atol=1e-14)
     assert t.translation == xyz
+    degrees = [math.degrees(angle) for angle in rpy]
+    assert Transform.from_xyz_rpy(xyz, degrees, degrees=True).is_close(t)
 
 
 # Conversions both ways
