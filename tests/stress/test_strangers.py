@@ -12,6 +12,7 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
+from support.damage import damaged
 from support.domains import Network, World
 from support.domains import Stranger as WrittenLink
 from support.local_links import RawPeer, files_in, framed
@@ -91,22 +92,10 @@ def valid(scene: Scene) -> list[bytes]:
 
 
 def mutated(scene: Scene) -> Iterator[bytes]:
-    random = scene.random
+    numbers = [number.to_bytes(8, "little")[:size] for number in EXTREMES for size in (1, 2, 4, 8)]
+    numbers += [struct.pack("<d", number) for number in (float("nan"), float("inf"), 1e308)]
     for _ in range(600):
-        data = bytearray(random.choice(valid(scene)))
-        for _ in range(random.choice([1, 1, 2, 5])):
-            place = random.randrange(len(data) + 1)
-            match random.randrange(4):
-                case 0:
-                    data[place : place + 1] = random.randbytes(1)
-                case 1:
-                    size = random.choice([1, 2, 4, 8])
-                    data[place : place + size] = (random.choice(EXTREMES) % 2 ** (8 * size)).to_bytes(size, "little")
-                case 2:
-                    del data[place : place + random.choice([1, 4, 8, 1_000])]
-                case _:
-                    data[place:place] = struct.pack("<d", random.choice([float("nan"), float("inf"), 1e308]))
-        yield bytes(data)
+        yield damaged(scene.random, scene.random.choice(valid(scene)), numbers)
 
 
 def garbage(scene: Scene) -> Iterator[bytes]:
