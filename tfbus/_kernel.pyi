@@ -109,10 +109,13 @@ class Judge:
 class Parked:
     answer: Any
     asked: Any
+    cancel_end: Any
     elsewhere: bool
     limit: Any
     names: tuple[str, ...] | None
+    patience: float
     place: Any
+    share: Any
     since: int
     version: int
     wake: Any
@@ -129,7 +132,11 @@ class Line:
 
 class Feed:
     begin: Any
+    call_after: Any
+    here: Any
     kind: type[Parked]
+    loop: Any
+    share: Any
     def __init__(
         self,
         paths: Paths,
@@ -142,7 +149,7 @@ class Feed:
         index: Any,
         /,
     ) -> None: ...
-    def ask(self, target: str, source: str, at: Any, turn: bool, /) -> Any: ...
+    def ask(self, target: str, source: str, at: Any, timeout: Any, /) -> Any: ...
     def insert(self, batch: tuple[Sample, ...], /) -> bool: ...
 
 class Intake:

@@ -14,7 +14,7 @@ from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
-from math import acos, sin, sqrt
+from math import acos, inf, sin, sqrt
 from typing import Any, TypeVar
 
 import numpy as np
@@ -183,6 +183,12 @@ class Parked:
         The plain answer that the insertion found when it woke the lookup, if there was one.
     version : int
         The version of the paths that gave this answer.
+    share : Share or None
+        The part of the buffer that asks.
+    patience : float
+        How long it waits at most, in s.
+    cancel_end : callable or None
+        Cancels the alarm of its end, if it has one.
     elsewhere : bool
         Whether its wake-up has to remove it from more than its line, these limits and the dict of all parked lookups.
     """
@@ -192,6 +198,9 @@ class Parked:
     limit: Place | None = None
     answer: Any = None
     version: int = 0
+    share: Any = None
+    patience: float = inf
+    cancel_end: Callable[[], object] | None = None
     elsewhere: bool = False
 
     def __init__(self, asked: Any, since: int, wake: Callable[[], object]) -> None:

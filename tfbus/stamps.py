@@ -263,6 +263,8 @@ def as_duration(seconds: float, name: str) -> float:
     ValueError
         If it is negative or NaN, or an integer beyond all floats.
     """
+    if type(seconds) is float and seconds >= 0.0:
+        return seconds
     if not is_real(seconds):
         raise TypeError(f"{name} must be a number of seconds, not {seconds!r}")
     if not seconds >= 0:

@@ -35,6 +35,7 @@ from tfbus import (
     from_seconds,
     to_seconds,
 )
+from tfbus._aio.loops import running_loop
 from tfbus.buffer.lookups import AlarmHeap, LoopAlarms
 from tfbus.errors import MAY_COME
 
@@ -144,14 +145,14 @@ def test_alarms_on_one_loop_ring_although_another_one_ran_meanwhile() -> None:
             rung.append("first")
             done.set()
 
-        alarms.call_after(0.001, ring)
+        alarms.on(running_loop())(0.001, ring)
         await anyio.to_thread.run_sync(anyio.run, on_the_other)
         await done.wait()
 
     async def on_the_other() -> None:
         there = anyio.Event()
-        alarms.call_after(60.0, partial(rung.append, "never"))()
-        alarms.call_after(0.001, there.set)
+        alarms.on(running_loop())(60.0, partial(rung.append, "never"))()
+        alarms.on(running_loop())(0.001, there.set)
         with anyio.fail_after(10.0):
             await there.wait()
 

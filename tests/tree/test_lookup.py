@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 from support.samples import moving, over, static, tree_of, x_of
 
-from tfbus import (
-    LATEST,
-    Buffer,
-    FutureExtrapolationError,
-    TransformTree,
-)
+from tfbus import LATEST, Buffer, FutureExtrapolationError, PastExtrapolationError, TransformTree
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 # Stamps and names
@@ -37,6 +32,28 @@ def test_not_before_applies_to_both_legs_of_time_travel() -> None:
 def test_any_text_is_a_frame_name_also_one_that_tf2_reserves() -> None:
     tree = tree_of(moving("NO_PARENT", "base link", 0, 1.0), moving("base link", "küche/🦾", 0, 1.0))
     assert x_of(tree, "NO_PARENT", "küche/🦾", 0) == 2.0
+
+
+def test_a_stamp_that_was_asked_before_is_answered_from_the_samples_that_there_are_now() -> None:
+    tree = tree_of(*over("a", "b", [0, 10]), *over("b", "c", [0, 10]), keep=2e-8)
+
+    def asked() -> list[float]:
+        return [x_of(tree, target, source, 5) for target, source in (("a", "b"), ("a", "c"), ("b", "c"), ("c", "a"))]
+
+    assert asked() == asked() == [5.0, 10.0, 5.0, -10.0]
+    tree.insert_many([moving("a", "b", 6, 12.0), moving("b", "c", 11, 11.0)])
+    assert asked() == [10.0, 15.0, 5.0, -15.0]
+    tree.insert(moving("a", "b", 6, 18.0))
+    assert asked() == [15.0, 20.0, 5.0, -20.0]
+    tree.insert(moving("a", "b", 20, 20.0))
+    assert asked() == [15.0, 20.0, 5.0, -20.0]
+    tree.insert(moving("a", "b", 26, 26.0))
+    for _ in range(2):
+        with pytest.raises(PastExtrapolationError):
+            tree.lookup("a", "c", 5)
+    tree.clear()
+    tree.insert_many(over("a", "b", [5]))
+    assert x_of(tree, "a", "b", 5) == 5.0
 
 
 # Arguments

@@ -25,7 +25,7 @@ import anyio.to_thread
 
 # trio writes its name here while it runs a task, also inside a task of asyncio, as in a cell of a notebook. It needs
 # sniffio, which anyio has imported if it is installed.
-_here: Any = getattr(sys.modules.get("sniffio"), "thread_local", SimpleNamespace(name=None))
+here: Any = getattr(sys.modules.get("sniffio"), "thread_local", SimpleNamespace(name=None))
 
 
 @coroutine
@@ -33,19 +33,14 @@ def _turn() -> Generator[None, None, None]:
     yield
 
 
-def on_asyncio() -> bool:
-    """Whether the running task is one of asyncio, which takes a bare yield of None as a checkpoint."""
-    return _here.name is None
-
-
 def checkpoint() -> Awaitable[None]:
     """`anyio.lowlevel.checkpoint`, without the way through anyio."""
-    return _turn() if _here.name is None else _lowlevel().checkpoint()
+    return _turn() if here.name is None else _lowlevel().checkpoint()
 
 
 def running_loop() -> Any:
     """The running event loop: the loop object of asyncio, or the token of trio."""
-    return get_running_loop() if _here.name is None else _lowlevel().current_trio_token()
+    return get_running_loop() if here.name is None else _lowlevel().current_trio_token()
 
 
 def _lowlevel() -> Any:
@@ -64,7 +59,7 @@ def wake_up(loop: Any) -> tuple[Generator[Any, None, None], Callable[[], object]
     If it was ended before the task awaits it, there is no checkpoint. The function may raise an `Exception` if the wait
     has ended, or the event loop is closed.
     """
-    if _here.name is None:
+    if here.name is None:
         # No function of Python is then on the way from a publish to the event loop.
         future = loop.create_future()
         return future.__await__(), partial(future.set_result, None)

@@ -474,6 +474,9 @@ typedef struct {
     Py_ssize_t from, moved;       /* the place of the first sample of `next` in `block`, and how many it has */
     Block *left;                  /* the block that it has moved out of, while its memory is given back, or NULL */
     int64_t keep;                 /* ns; -1 for ever */
+    int64_t asked;                /* the stamp between two samples that was asked for last */
+    double row[WIDTH];            /* of that stamp; it holds as long as the stamp is in the window */
+    char has_row;                 /* whether there is such a row */
     char mixed;                   /* whether the samples name several parents */
 } History;
 
@@ -708,7 +711,7 @@ history_init(History *self, PyObject *args, PyObject *kwargs)
     history_change_block(self, NULL, 0);
     self->start = self->end = 0;
     self->keep = window;
-    self->mixed = 0;
+    self->mixed = self->has_row = 0;
     for (int i = 0; i < 2; i++) {
         Py_XDECREF(old[i]);
     }
@@ -909,6 +912,7 @@ history_put(History *self, PyObject *const *args, Py_ssize_t count)
         return NULL;
     }
     history_stop_moving(self);
+    self->has_row = 0;
     /* It may have been moved. */
     place = self->start + index;
     const Py_ssize_t behind = self->end - place;
@@ -929,6 +933,7 @@ history_clear(History *self, PyObject *Py_UNUSED(ignored))
 {
     history_change_block(self, NULL, 0);
     self->start = self->end = 0;
+    self->has_row = 0;
     Py_RETURN_NONE;
 }
 
@@ -954,6 +959,7 @@ history_take(History *self, PyObject *other)
     history_change_block(self, block, 0);
     self->start = 0;
     self->end = count;
+    self->has_row = 0;
     Py_RETURN_NONE;
 }
 
@@ -1168,21 +1174,14 @@ samples_of(const History *edge)
     return samples;
 }
 
-static Status
+static inline Py_ALWAYS_INLINE Status
 find_segment(const Samples *samples, int64_t at, Segment *segment)
 {
     const Py_ssize_t last = samples->count - 1;
-    if (last < 0 || at > samples->stamps[last]) {
+    if (last < 0 || at < samples->stamps[0] || at > samples->stamps[last]) {
         return MISSING;
     }
-    /* Behind the last but one are most of the stamps that `LATEST` asks for. */
-    Py_ssize_t i = last;
-    if (at != samples->stamps[last] && (last == 0 || at <= samples->stamps[last - 1])) {
-        if (at < samples->stamps[0]) {
-            return MISSING;
-        }
-        i = lower_bound(samples->stamps, samples->count, at);
-    }
+    const Py_ssize_t i = at == samples->stamps[last] ? last : lower_bound(samples->stamps, samples->count, at);
     segment->after = samples->stamps[i];
     segment->a = NULL;
     segment->b = samples->rows + WIDTH * i;

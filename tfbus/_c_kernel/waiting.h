@@ -3,12 +3,17 @@
  * A Parked is one waiting lookup. A Line is the lookups under one frame; its `places` are sorted so that the next one due
  * is the last. A Feed is the plain way into and out of the waiting lookups of one buffer.
  *
- * `ask` gives a Parked to be awaited: a turn of the loop, then the answer, or a sleep until an insertion brings it. It is
- * parked in the line of the edge that lags most if newer samples are all that it lacks; no error says so, because Python
- * words that when somebody asks. The event loop is Python's: `begin` makes the wake-up, notes the time, sets the alarms,
- * and gives the iterator that sleeps. At the end there is no answer where the question is not plain, or the answer did not
- * hold until the task ran; then the coroutine that awaits the Parked goes on. An exception (a cancellation) is thrown into that
- * coroutine, and it takes the Parked out of the index: there is no `throw` here.
+ * `ask` gives a Parked to be awaited. If newer samples are all that its question lacks, it is parked in the line of the
+ * edge that lags most, and sleeps until an insertion brings the answer; no error says so, because Python words that when
+ * somebody asks. Else it takes a turn of the loop and asks; then it has its answer, or sleeps after all. So it lets the
+ * others run once in either case, and nothing happens between the insertion or the asking and the answer. At the end
+ * there is no answer where the question is not plain, or the answer did not hold until the task ran; then the coroutine
+ * that awaits the Parked goes on. An exception (a cancellation) is thrown into that coroutine, and it takes the Parked out
+ * of the index: there is no `throw` here.
+ *
+ * The event loop is Python's: `begin` makes the wake-up, notes the time, sets the alarms, and gives the iterator that
+ * sleeps. After it has checked the thread and set the alarm for all lookups that hang, it names the `loop`; there, a sleep
+ * is a future of asyncio or a task of trio, and takes no more of Python than they do.
  *
  * `insert` stores a batch, pops from the lines of its frames whoever is due, and calls `wake` with the answer already
  * found, if that is plain. It takes a batch only if the lines need nothing else: nobody waits for any sample, no limit is
@@ -23,23 +28,53 @@
 typedef struct {
     PyObject_HEAD
     PyObject *asked;    /* a tuple: target, source, at, and options that are all None if it is plain */
-    PyObject *wake;     /* called without arguments, once */
+    PyObject *wake;     /* called without arguments, once; or the future or the task of trio that is woken */
     PyObject *place;    /* its place in a line, if it has one */
     PyObject *answer;   /* the answer of the insertion that woke it */
     PyObject *names;    /* the frames that block it, a tuple */
     PyObject *limit;    /* its place among the first limits, if it has one */
     PyObject *feed;     /* the Feed that it asks, while it is awaited */
     PyObject *sleeper;  /* the iterator that sleeps until `wake` is called */
+    PyObject *share;    /* of the buffer that asks */
+    PyObject *cancel_end; /* called without arguments, cancels the alarm of its end; NULL if there is none */
+    double patience;    /* how long it waits at most, in s */
     long long since;    /* when it began to wait, in ns */
     long long version;  /* of the paths, when they had this answer */
     char elsewhere;     /* whether Python has noted it elsewhere, and has to forget it */
     char step;          /* of those below */
-    char turned;        /* whether it has taken a turn of the loop */
+    char on_asyncio;    /* whether a bare yield is a turn of the loop */
+    char wakes;         /* which of these */
 } Parked;
 
-enum { NOT_AWAITED, BEFORE_TURN, AFTER_TURN, ASLEEP };
+enum { NOT_AWAITED, BEFORE_TURN, AT_TURN, ASLEEP };
 
-REFERENCES(parked, 8)
+REFERENCES(parked, 10)
+
+enum { CALLABLE, FUTURE, TASK };
+
+/* Of trio.lowlevel, once one is needed. */
+static PyObject *trio_checkpoint, *reschedule, *wait_task_rescheduled, *current_task, *abort_succeeded;
+
+static int
+needs_trio(void)
+{
+    const struct {
+        const char *name;
+        PyObject **place;
+    } wanted[] = {{"checkpoint", &trio_checkpoint}, {"reschedule", &reschedule}, {"current_task", &current_task},
+                  {"wait_task_rescheduled", &wait_task_rescheduled}};
+    for (size_t i = 0; i < sizeof wanted / sizeof *wanted; i++) {
+        if (*wanted[i].place == NULL && (*wanted[i].place = imported("trio.lowlevel", wanted[i].name)) == NULL) {
+            return 0;
+        }
+    }
+    PyObject *abort = abort_succeeded != NULL ? NULL : imported("trio.lowlevel", "Abort");
+    if (abort != NULL) {
+        abort_succeeded = PyObject_GetAttrString(abort, "SUCCEEDED");
+        Py_DECREF(abort);
+    }
+    return abort_succeeded != NULL;
+}
 
 static PySendResult parked_step(PyObject *self, PyObject *value, PyObject **result);
 
@@ -74,11 +109,6 @@ parked_await(PyObject *self)
     return self;
 }
 
-static PyMethodDef parked_methods[] = {
-    {"send", (PyCFunction)parked_send, METH_O, PyDoc_STR("send(value): go on; as that of a coroutine.")},
-    {NULL}
-};
-
 static int
 parked_init(Parked *self, PyObject *args, PyObject *kwargs)
 {
@@ -94,18 +124,82 @@ parked_init(Parked *self, PyObject *args, PyObject *kwargs)
     self->asked = asked;
     self->wake = wake;
     self->since = since;
+    self->patience = Py_HUGE_VAL;
+    self->wakes = CALLABLE;
     Py_XDECREF(old[0]);
     Py_XDECREF(old[1]);
     return 0;
 }
 
+/* Wake it, if it was not woken. */
+static PyObject *
+parked_end(Parked *self, PyObject *Py_UNUSED(ignored))
+{
+    PyObject *wake = self->wake, *done;
+    if (wake == NULL) {
+        Py_RETURN_NONE;
+    }
+    self->wake = NULL;
+    if (self->wakes == FUTURE) {
+        done = PyObject_CallMethodObjArgs(wake, set_result_string, Py_None, NULL);
+    } else if (self->wakes == TASK) {
+        done = PyObject_CallFunctionObjArgs(reschedule, wake, NULL);
+    } else {
+        done = PyObject_CallNoArgs(wake);
+    }
+    Py_DECREF(wake);
+    return done;
+}
+
+/* trio has cancelled the wait of its task. */
+static PyObject *
+parked_abort(Parked *self, PyObject *Py_UNUSED(raise_cancel))
+{
+    Py_CLEAR(self->wake);
+    return Py_NewRef(abort_succeeded);
+}
+
+static PyObject *
+parked_wake(Parked *self, void *Py_UNUSED(closure))
+{
+    if (self->wakes == CALLABLE) {
+        return Py_NewRef(self->wake == NULL ? Py_None : self->wake);
+    }
+    return PyObject_GetAttr(OBJECT(self), end_string);
+}
+
+static int
+parked_set_wake(Parked *self, PyObject *value, void *Py_UNUSED(closure))
+{
+    PyObject *old = self->wake;
+    Py_XINCREF(value);
+    self->wake = value;
+    self->wakes = CALLABLE;
+    Py_XDECREF(old);
+    return 0;
+}
+
+static PyMethodDef parked_methods[] = {
+    {"abort", (PyCFunction)parked_abort, METH_O, PyDoc_STR("abort(raise_cancel): end the wait, as trio has cancelled it.")},
+    {"end", (PyCFunction)parked_end, METH_NOARGS, PyDoc_STR("end(): wake it, if it was not woken.")},
+    {"send", (PyCFunction)parked_send, METH_O, PyDoc_STR("send(value): go on; as that of a coroutine.")},
+    {NULL}
+};
+
+static PyGetSetDef parked_getset[] = {
+    {"wake", (getter)parked_wake, (setter)parked_set_wake, PyDoc_STR("Called once, after it was taken out of its line."), NULL},
+    {NULL}
+};
+
 static PyMemberDef parked_members[] = {
     {"asked", T_OBJECT, offsetof(Parked, asked), 0, PyDoc_STR("Target, source, at, and the options.")},
-    {"wake", T_OBJECT, offsetof(Parked, wake), 0, PyDoc_STR("Called once, after it was taken out of its line.")},
     {"place", T_OBJECT, offsetof(Parked, place), 0, PyDoc_STR("Its place in a line, or None.")},
     {"answer", T_OBJECT, offsetof(Parked, answer), 0, PyDoc_STR("The answer of the insertion that woke it, or None.")},
     {"names", T_OBJECT, offsetof(Parked, names), 0, PyDoc_STR("The frames that block it.")},
     {"limit", T_OBJECT, offsetof(Parked, limit), 0, PyDoc_STR("Its place among the first limits, or None.")},
+    {"share", T_OBJECT, offsetof(Parked, share), 0, PyDoc_STR("The share of the buffer that asks, or None.")},
+    {"cancel_end", T_OBJECT, offsetof(Parked, cancel_end), 0, PyDoc_STR("Cancels the alarm of its end; None if it has none.")},
+    {"patience", T_DOUBLE, offsetof(Parked, patience), 0, PyDoc_STR("How long it waits at most, in s.")},
     {"since", T_LONGLONG, offsetof(Parked, since), 0, PyDoc_STR("When it began to wait, in ns.")},
     {"version", T_LONGLONG, offsetof(Parked, version), 0, PyDoc_STR("The version of the paths that gave this answer.")},
     {"elsewhere", T_BOOL, offsetof(Parked, elsewhere), 0, PyDoc_STR("Whether Python has to forget it.")},
@@ -125,6 +219,7 @@ static PyType_Slot parked_slots[] = {
     {Py_tp_traverse, parked_traverse},
     {Py_tp_clear, parked_clear},
     {Py_tp_members, parked_members},
+    {Py_tp_getset, parked_getset},
     {0, NULL}
 };
 
@@ -141,6 +236,8 @@ typedef struct {
 } Line;
 
 REFERENCES(line, 3)
+
+static Line *spare; /* an empty one; NULL if there is none */
 
 static int
 line_init(Line *self, PyObject *Py_UNUSED(args), PyObject *Py_UNUSED(kwargs))
@@ -160,6 +257,30 @@ static int
 line_has_places_only(const Line *self)
 {
     return self->places != NULL && PyDict_Size(self->for_any) == 0 && PyList_Size(self->limits) == 0;
+}
+
+/* An empty line; a new reference. */
+static PyObject *
+line_new(void)
+{
+    Line *line = spare;
+    if (line == NULL) {
+        return PyObject_CallNoArgs(OBJECT(LineType));
+    }
+    spare = NULL;
+    return OBJECT(line);
+}
+
+/* The end of a reference to an empty line. A line and its containers take as long to make as the rest of the parking, so
+ * one is kept. */
+static void
+line_end(Line *line)
+{
+    if (spare == NULL && Py_REFCNT(OBJECT(line)) == 1 && Py_TYPE(OBJECT(line)) == LineType) {
+        spare = line;
+    } else {
+        Py_DECREF(OBJECT(line));
+    }
 }
 
 static PyMemberDef line_members[] = {
@@ -184,7 +305,7 @@ static PyType_Spec line_spec = {
     "tfbus._kernel.Line", sizeof(Line), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, line_slots
 };
 
-enum { PATHS, FRAMES, READERS, LINES, PARKED, LIMITS, WATCHES, INDEX, ORDERS, FORGET, KIND, BEGIN, PARTS };
+enum { PATHS, FRAMES, READERS, LINES, PARKED, LIMITS, WATCHES, INDEX, ORDERS, FORGET, KIND, BEGIN, CALL_AFTER, SHARE, HERE, LOOP, HOOK, PARTS };
 
 typedef struct {
     PyObject_HEAD
@@ -207,8 +328,8 @@ feed_init(Feed *self, PyObject *args, PyObject *kwargs)
         PyErr_SetString(PyExc_RuntimeError, "a Feed is initialised once, because it may be at work");
         return -1;
     }
-    parts[ORDERS] = PyObject_GetAttrString(parts[INDEX], "orders");
-    parts[FORGET] = parts[ORDERS] == NULL ? NULL : PyObject_GetAttrString(parts[INDEX], "forget");
+    parts[ORDERS] = PyObject_GetAttr(parts[INDEX], orders_string);
+    parts[FORGET] = parts[ORDERS] == NULL ? NULL : PyObject_GetAttr(parts[INDEX], forget_string);
     if (parts[FORGET] == NULL || !PyIter_Check(parts[ORDERS])) {
         Py_XDECREF(parts[ORDERS]);
         Py_XDECREF(parts[FORGET]);
@@ -290,7 +411,10 @@ line_up(PyObject *places, PyObject **place, Parked *waiter, int64_t stamp, PyObj
         }
         return -1;
     }
-    PyObject *made = Py_BuildValue("(LLO)", (long long)-stamp, -number, OBJECT(waiter));
+    PyObject *due = PyLong_FromLongLong(-stamp), *turn = PyLong_FromLongLong(-number);
+    PyObject *made = due == NULL || turn == NULL ? NULL : PyTuple_Pack(3, due, turn, OBJECT(waiter));
+    Py_XDECREF(due);
+    Py_XDECREF(turn);
     const Py_ssize_t index = made == NULL ? -1 : place_index(places, made);
     if (index < 0 || PyList_Insert(places, index, made) < 0) {
         Py_XDECREF(made);
@@ -376,7 +500,7 @@ feed_line_up(const Feed *self, Parked *waiter, PyObject *child, int64_t at, int6
     PyObject *line = PyDict_GetItemWithError(lines, child);
     Py_XINCREF(line);
     if (line == NULL) {
-        line = PyErr_Occurred() ? NULL : PyObject_CallNoArgs(OBJECT(LineType));
+        line = PyErr_Occurred() ? NULL : line_new();
         if (line == NULL || PyDict_SetItem(lines, child, line) < 0) {
             Py_XDECREF(line);
             return -1;
@@ -416,30 +540,27 @@ feed_edge(const Feed *self, const Parked *waiter, int64_t *at, int64_t *limit)
     return failed || *limit < passed ? NULL : edge;
 }
 
-/* Park a waiter if newer samples are all that its question lacks: 1. 0, and nothing is done, if Python has to look closer;
- * -1 for an error, and then Python removes what is in the index. */
-static int
-feed_park(const Feed *self, Parked *waiter)
-{
-    int64_t at, limit;
-    const History *edge = feed_edge(self, waiter, &at, &limit);
-    if (edge == NULL) {
-        return PyErr_Occurred() ? -1 : 0;
-    }
-    PyObject *child = PyObject_GetAttr(OBJECT(edge), child_string);
-    const int failed = child == NULL || feed_line_up(self, waiter, child, at, limit) < 0;
-    Py_XDECREF(child);
-    return failed ? -1 : 1;
-}
-
-/* ask(target, source, at, turn): a lookup to be awaited: a turn of the loop first if `turn` is true. */
+/* ask(target, source, at, timeout): a lookup to be awaited, once. None if the timeout is neither None nor a float in s. */
 static PyObject *
 feed_ask(Feed *self, PyObject *const *args, Py_ssize_t nargs)
 {
-    if (nargs != 4 || self->parts[KIND] == NULL || self->parts[BEGIN] == NULL) {
-        PyErr_SetString(PyExc_TypeError, "ask takes target, source, at and whether to take a turn, after kind and begin");
+    if (nargs != 4 || self->parts[KIND] == NULL || self->parts[HERE] == NULL) {
+        PyErr_SetString(PyExc_TypeError, "ask takes target, source, at and a timeout, after kind and here");
         return NULL;
     }
+    double patience = Py_HUGE_VAL;
+    if (args[3] != Py_None) {
+        patience = PyFloat_CheckExact(args[3]) ? PyFloat_AsDouble(args[3]) : -1.0;
+        /* Not `<`, which is false for NaN. */
+        if (!(patience >= 0.0)) {
+            Py_RETURN_NONE;
+        }
+    }
+    PyObject *name = PyObject_GetAttr(self->parts[HERE], name_string);
+    if (name == NULL) {
+        return NULL;
+    }
+    Py_DECREF(name);
     PyObject *question = PyTuple_Pack(3, args[0], args[1], args[2]);
     Parked *made = question == NULL ? NULL : (Parked *)PyType_GenericAlloc((PyTypeObject *)self->parts[KIND], 0);
     if (made == NULL) {
@@ -449,31 +570,109 @@ feed_ask(Feed *self, PyObject *const *args, Py_ssize_t nargs)
     made->asked = question;
     Py_INCREF(OBJECT(self));
     made->feed = OBJECT(self);
-    made->step = args[3] == Py_True ? BEFORE_TURN : AFTER_TURN;
+    made->patience = patience;
+    made->on_asyncio = name == Py_None;
+    made->step = BEFORE_TURN;
     return OBJECT(made);
 }
 
-/* Ask; if newer samples are all that is missing, begin to sleep: 1. 0 if it has its answer, or Python has to go on; -1 for
- * an error. */
-static int
-parked_ask(Parked *self, const Feed *feed)
+/* The hook of this thread for new asynchronous generators, or NULL. Each event loop sets one of its own while it runs; to ask
+ * which loop runs takes asyncio a call of the operating system. */
+static PyObject *
+hook_of_loop(void)
 {
-    PyObject *asked[3];
-    int64_t at, limit;
-    if (feed->parts[PATHS] == NULL || feed->parts[BEGIN] == NULL || !is_plain(self, asked)) {
-        return 0;
+    static PyObject *ask;
+    if (ask == NULL && (ask = imported("sys", "get_asyncgen_hooks")) == NULL) {
+        return NULL;
     }
-    PyObject *old = self->answer;
-    self->answer = paths_answer((Paths *)feed->parts[PATHS], asked, 3);
+    PyObject *hooks = PyObject_CallNoArgs(ask);
+    PyObject *hook = hooks == NULL ? NULL : PySequence_GetItem(hooks, 0);
+    Py_XDECREF(hooks);
+    return hook;
+}
+
+/* The bare sleep of a waiter on asyncio or trio, and what wakes it; NULL for an error. */
+static PyObject *
+bare_sleep(Parked *waiter, PyObject *loop)
+{
+    PyObject *wakes, *sleep = NULL, *old = waiter->wake;
+    if (waiter->on_asyncio) {
+        wakes = PyObject_CallMethodObjArgs(loop, create_future_string, NULL);
+        sleep = wakes == NULL ? NULL : PyObject_GetIter(wakes);
+    } else {
+        wakes = needs_trio() ? PyObject_CallNoArgs(current_task) : NULL;
+        PyObject *abort = wakes == NULL ? NULL : PyObject_GetAttr(OBJECT(waiter), abort_string);
+        sleep = abort == NULL ? NULL : PyObject_CallFunctionObjArgs(wait_task_rescheduled, abort, NULL);
+        Py_XDECREF(abort);
+    }
+    if (sleep == NULL) {
+        Py_XDECREF(wakes);
+        return NULL;
+    }
+    waiter->wake = wakes;
+    waiter->wakes = waiter->on_asyncio ? FUTURE : TASK;
     Py_XDECREF(old);
-    if (self->answer != Py_None || feed_edge(feed, self, &at, &limit) == NULL) {
+    return sleep;
+}
+
+/* The iterator that sleeps until a waiter is woken; None to let Python go on. */
+static PyObject *
+feed_sleeper(const Feed *self, Parked *waiter)
+{
+    PyObject *loop = self->parts[LOOP], *hook = NULL, *sleeper;
+    int64_t now;
+    if (loop != NULL && waiter->patience > 0.0 && (hook = hook_of_loop()) == NULL) {
+        return NULL;
+    }
+    const int known = hook != NULL && hook == self->parts[HOOK] && paths_now((const Paths *)self->parts[PATHS], &now);
+    Py_XDECREF(hook);
+    if (!known) {
+        return PyErr_Occurred() ? NULL : PyObject_CallFunctionObjArgs(self->parts[BEGIN], OBJECT(waiter), NULL);
+    }
+    Py_INCREF(loop);
+    if ((sleeper = bare_sleep(waiter, loop)) != NULL) {
+        PyObject *old = waiter->share;
+        waiter->share = self->parts[SHARE] == NULL ? NULL : Py_NewRef(self->parts[SHARE]);
+        waiter->since = now;
+        Py_XDECREF(old);
+    }
+    Py_DECREF(loop);
+    if (sleeper != NULL && waiter->patience < Py_HUGE_VAL && waiter->cancel_end == NULL) {
+        PyObject *seconds = PyFloat_FromDouble(waiter->patience), *expire = PyObject_GetAttr(OBJECT(waiter), expire_string);
+        if (seconds != NULL && expire != NULL && self->parts[CALL_AFTER] != NULL) {
+            waiter->cancel_end = PyObject_CallFunctionObjArgs(self->parts[CALL_AFTER], seconds, expire, NULL);
+        }
+        Py_XDECREF(seconds);
+        Py_XDECREF(expire);
+        if (waiter->cancel_end == NULL) {
+            Py_CLEAR(sleeper);
+        }
+    }
+    return sleeper;
+}
+
+/* If newer samples are all that is missing, begin to sleep: 1. 0 if not, or Python has to go on; -1 for an error, and
+ * then Python removes what is in the index. */
+static int
+parked_sleep(Parked *self, const Feed *feed)
+{
+    int64_t at, limit;
+    const Paths *paths = (const Paths *)feed->parts[PATHS];
+    const History *edge = feed->parts[BEGIN] == NULL ? NULL : feed_edge(feed, self, &at, &limit);
+    PyObject *child = edge == NULL ? NULL : PyObject_GetAttr(OBJECT(edge), child_string);
+    if (child == NULL) {
         return PyErr_Occurred() ? -1 : 0;
     }
-    PyObject *turned = self->turned ? Py_True : Py_False;
-    PyObject *sleeper = PyObject_CallFunctionObjArgs(feed->parts[BEGIN], OBJECT(self), turned, NULL);
-    const int parked = sleeper == NULL ? -1 : sleeper == Py_None ? 0 : feed_park(feed, self);
+    const long long version = paths->version;
+    PyObject *sleeper = feed_sleeper(feed, self);
+    int parked = sleeper == NULL ? -1 : 0;
+    /* Python code has run: the collector may call anything. */
+    if (parked == 0 && sleeper != Py_None && feed->parts[PATHS] == OBJECT(paths) && paths->version == version) {
+        parked = feed_line_up(feed, self, child, at, limit) < 0 ? -1 : 1;
+    }
+    Py_DECREF(child);
     if (parked > 0) {
-        old = self->sleeper;
+        PyObject *old = self->sleeper;
         self->sleeper = sleeper;
         sleeper = old;
     }
@@ -481,52 +680,75 @@ parked_ask(Parked *self, const Feed *feed)
     return parked;
 }
 
+/* Ask; without an answer, as `parked_sleep`. */
+static int
+parked_ask(Parked *self, const Feed *feed)
+{
+    PyObject *asked[3];
+    if (feed->parts[PATHS] == NULL || !is_plain(self, asked)) {
+        return 0;
+    }
+    PyObject *old = self->answer;
+    self->answer = paths_answer((Paths *)feed->parts[PATHS], asked, 3);
+    Py_XDECREF(old);
+    return self->answer == Py_None ? parked_sleep(self, feed) : self->answer == NULL ? -1 : 0;
+}
+
 /* One step of the wait. At its end, the answer is there if it holds. */
 static PySendResult
 parked_step(PyObject *itself, PyObject *value, PyObject **result)
 {
     Parked *self = (Parked *)itself;
-    Feed *feed = (Feed *)self->feed;
+    const Feed *feed = (const Feed *)self->feed;
+    char step = self->step;
+    int sleeps;
     *result = NULL;
-    if (self->step == BEFORE_TURN) {
-        self->step = AFTER_TURN;
-        self->turned = 1;
-        Py_INCREF(Py_None);
-        *result = Py_None;
-        return PYGEN_NEXT;
-    }
-    if (self->step == AFTER_TURN && feed != NULL) {
-        self->step = NOT_AWAITED;
-        const int sleeps = parked_ask(self, feed);
-        if (sleeps < 0) {
-            return PYGEN_ERROR;
-        }
-        if (!sleeps) {
-            Py_INCREF(Py_None);
-            *result = Py_None;
-            return PYGEN_RETURN;
-        }
-        self->step = ASLEEP;
-        value = Py_None;
-    }
-    if (self->step != ASLEEP || self->sleeper == NULL) {
+    if (step == NOT_AWAITED || feed == NULL) {
         PyErr_SetString(PyExc_RuntimeError, "a lookup is awaited once");
         return PYGEN_ERROR;
     }
-    PyObject *sleeper = self->sleeper;
-    self->sleeper = NULL;
-    const PySendResult sent = PyIter_Send(sleeper, value, result);
-    if (sent == PYGEN_NEXT) {
-        self->sleeper = sleeper;
-        return sent;
-    }
-    Py_DECREF(sleeper);
     self->step = NOT_AWAITED;
-    const Paths *paths = (Paths *)feed->parts[PATHS];
-    if (paths == NULL || self->version != paths->version) {
-        Py_CLEAR(self->answer);
+    if (step == BEFORE_TURN) {
+        if ((sleeps = parked_sleep(self, feed)) < 0) {
+            return PYGEN_ERROR;
+        }
+        step = sleeps ? ASLEEP : AT_TURN;
+        if (!sleeps && self->on_asyncio) {
+            self->step = AT_TURN;
+            *result = Py_NewRef(Py_None);
+            return PYGEN_NEXT;
+        }
+        if (!sleeps && (!needs_trio() || (self->sleeper = PyObject_CallNoArgs(trio_checkpoint)) == NULL)) {
+            return PYGEN_ERROR;
+        }
     }
-    return sent;
+    for (;;) {
+        PyObject *sleeper = self->sleeper;
+        if (sleeper != NULL) {
+            self->sleeper = NULL;
+            const PySendResult sent = PyIter_Send(sleeper, value, result);
+            if (sent == PYGEN_NEXT) {
+                self->sleeper = sleeper;
+                self->step = step;
+                return sent;
+            }
+            Py_DECREF(sleeper);
+            const Paths *paths = (const Paths *)feed->parts[PATHS];
+            if (step == ASLEEP && (paths == NULL || self->version != paths->version)) {
+                Py_CLEAR(self->answer);
+            }
+            if (step == ASLEEP || sent == PYGEN_ERROR) {
+                return sent;
+            }
+            Py_CLEAR(*result);
+        }
+        if ((sleeps = parked_ask(self, feed)) <= 0) {
+            *result = sleeps < 0 ? NULL : Py_NewRef(Py_None);
+            return sleeps < 0 ? PYGEN_ERROR : PYGEN_RETURN;
+        }
+        step = ASLEEP;
+        value = Py_None;
+    }
 }
 
 /* Whether the wake-ups of a batch are plain: only lookups that need a stamp wait for its frames, nobody watches them,
@@ -609,8 +831,12 @@ feed_pop(PyObject *lines, PyObject *child, Line *line, Py_ssize_t last)
     }
     /* The place refers to the waiter. */
     Py_CLEAR(((Parked *)item)->place);
-    if (last == 0 && line_has_places_only(line) && PyDict_DelItem(lines, child) < 0) {
-        PyErr_Clear();
+    if (last == 0 && line_has_places_only(line)) {
+        Py_INCREF(OBJECT(line));
+        if (PyDict_DelItem(lines, child) < 0) {
+            PyErr_Clear();
+        }
+        line_end(line);
     }
     return item;
 }
@@ -677,10 +903,7 @@ feed_wake(const Feed *self, PyObject *child, int64_t stamp, Trouble *trouble)
         }
         feed_answer(self, waiter);
         if (waiter->wake != NULL) {
-            PyObject *wake = waiter->wake;
-            Py_INCREF(wake);
-            PyObject *woken = PyObject_CallNoArgs(wake);
-            Py_DECREF(wake);
+            PyObject *woken = parked_end(waiter, NULL);
             if (woken == NULL) {
                 if (PyErr_ExceptionMatches(PyExc_Exception)) {
                     /* Its wait was cancelled, or its event loop is gone. */
@@ -738,7 +961,8 @@ feed_insert(Feed *self, PyObject *batch)
 
 static PyMethodDef feed_methods[] = {
     {"ask", FAST(feed_ask), METH_FASTCALL,
-     PyDoc_STR("ask(target, source, at, turn): a lookup to be awaited, once; then it has its answer, or Python has to go on.")},
+     PyDoc_STR("ask(target, source, at, timeout): a lookup to be awaited, once; then it has its answer, or Python has to "
+               "go on. None if the timeout is neither None nor a float that is a duration.")},
     {"insert", (PyCFunction)feed_insert, METH_O,
      PyDoc_STR("insert(batch): store a batch and wake the lookups that it has unblocked, if all is plain; else do "
                "nothing.")},
@@ -752,22 +976,67 @@ feed_set_kind(Feed *self, PyObject *kind, void *Py_UNUSED(closure))
         PyErr_SetString(PyExc_TypeError, "kind must be a class of parked lookups");
         return -1;
     }
+    /* A class that was made in Python has no `am_send`, and each step of a task of trio would cost an exception. */
+    static PyObject *base, *made;
+    if (base != kind) {
+        PyType_Slot slots[] = {{Py_am_await, parked_await}, {Py_am_send, parked_step}, {0, NULL}};
+        PyType_Spec spec = {"tfbus._kernel.Awaited", 0, 0, Py_TPFLAGS_DEFAULT, slots};
+        PyObject *derived = PyType_FromSpecWithBases(&spec, kind), *old[] = {base, made};
+        if (derived == NULL) {
+            return -1;
+        }
+        Py_INCREF(kind);
+        base = kind;
+        made = derived;
+        Py_XDECREF(old[0]);
+        Py_XDECREF(old[1]);
+    }
     PyObject *old = self->parts[KIND];
-    Py_INCREF(kind);
-    self->parts[KIND] = kind;
+    self->parts[KIND] = Py_NewRef(made);
     Py_XDECREF(old);
     return 0;
 }
 
+static PyObject *
+feed_loop(Feed *self, void *Py_UNUSED(closure))
+{
+    return Py_NewRef(self->parts[LOOP] == NULL ? Py_None : self->parts[LOOP]);
+}
+
+static int
+feed_set_loop(Feed *self, PyObject *loop, void *Py_UNUSED(closure))
+{
+    PyObject *hook = NULL, *old[] = {self->parts[LOOP], self->parts[HOOK]};
+    loop = loop == Py_None ? NULL : loop;
+    if (loop != NULL && (hook = hook_of_loop()) == NULL) {
+        return -1;
+    }
+    if (hook == Py_None) {
+        Py_CLEAR(hook);
+    }
+    Py_XINCREF(loop);
+    self->parts[LOOP] = loop;
+    self->parts[HOOK] = hook;
+    Py_XDECREF(old[0]);
+    Py_XDECREF(old[1]);
+    return 0;
+}
+
 static PyGetSetDef feed_getset[] = {
+    {"loop", (getter)feed_loop, (setter)feed_set_loop,
+     PyDoc_STR("The event loop that runs while this is set, and on which lookups then sleep without `begin`; or None."), NULL},
     {"kind", NULL, (setter)feed_set_kind, PyDoc_STR("The class of what `ask` gives."), NULL},
     {NULL}
 };
 
 static PyMemberDef feed_members[] = {
     {"begin", T_OBJECT, offsetof(Feed, parts[BEGIN]), 0,
-     PyDoc_STR("begin(waiter, turned): the iterator that sleeps until `wake` of the waiter is called; None to let Python go "
-               "on. `turned` says whether the waiter has taken a turn of the loop.")},
+     PyDoc_STR("begin(waiter): the iterator that sleeps until `wake` of the waiter is called; None to let Python go on.")},
+    {"call_after", T_OBJECT, offsetof(Feed, parts[CALL_AFTER]), 0,
+     PyDoc_STR("call_after(seconds, callback): set an alarm on that loop, and return what cancels it.")},
+    {"here", T_OBJECT, offsetof(Feed, parts[HERE]), 0,
+     PyDoc_STR("Its `name` is None in a task of asyncio, and the name of another library in a task of that.")},
+    {"share", T_OBJECT, offsetof(Feed, parts[SHARE]), 0, PyDoc_STR("The share of the buffer that asks.")},
     {NULL}
 };
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Any, SupportsIndex, TypeVar
 
-from tfbus._aio.loops import checkpoint, on_asyncio
+from tfbus._aio.loops import checkpoint
 from tfbus.buffer.lookups import LocalNames, Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
@@ -127,7 +127,7 @@ class Buffer:
     def _stand_on(self, forest: Forest) -> None:
         self._forest = self._lookups.forest = forest
         self._paths = forest.paths if self._local_names is None else forest.local_paths()
-        self._paths.now = self.bus.clock.now
+        self._paths.now = self._lookups.now
         plain = self._local_names is None and self._lookups.has_alarms and forest is self._share.live.forest
         self._feed = self._lookups.feed if plain else None
 
@@ -262,13 +262,10 @@ class Buffer:
             return await self._lookups.lookup(self._on_bus(question), timeout)
         live = self._share.live
         last_reset = live.last_reset
-        turn = on_asyncio()
-        wait = self._feed.ask(target, source, at, turn)
-        if timeout is not None:
-            wait.patience = as_duration(timeout, "timeout")
+        wait = self._feed.ask(target, source, at, timeout)
+        if wait is None and timeout is not None:
+            wait = self._feed.ask(target, source, at, as_duration(timeout, "timeout"))
         try:
-            if not turn:
-                await checkpoint()
             await wait
             found: TransformStamped | None = wait.answer
             if found is None or live.last_reset is not last_reset:
@@ -394,15 +391,17 @@ class Buffer:
         """
         at, stamps = deskew_stamps(cloud)
         policy = policy_of(tolerance, max_gap, extrapolate)
-        ends = (int(stamps.max()), int(stamps.min())) if len(stamps) else ()
-        questions = [Question(fixed, cloud.frame, end, policy=policy) for end in ends]
-        questions.append(Question(target, fixed, at, policy=policy))
+        # The oldest one first: it may fail at once.
+        ends = (int(stamps.min()), int(stamps.max())) if len(stamps) else ()
+        questions = [self._on_bus(Question(fixed, cloud.frame, end, policy=policy)) for end in ends]
+        questions.append(self._on_bus(Question(target, fixed, at, policy=policy)))
         patience = math.inf if timeout is None else as_duration(timeout, "timeout")
         with self._clock.move_on_after(patience) as all_of_them:
-            await self._lookup_among(questions)
+            for question in questions:
+                await self._lookups.lookup(question, None)
         for question in questions if all_of_them.cancelled_caught else ():
             try:
-                await self._lookups.lookup(self._on_bus(question), 0.0)
+                await self._lookups.lookup(question, 0.0)
             except LookupTimeoutError as error:
                 error.timeout = patience
                 raise

@@ -19,16 +19,15 @@ that have waited for 5 s and logs them. The error that blocks a lookup is worded
 import logging
 import math
 import sys
-from asyncio import get_running_loop
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from heapq import heapify, heappop, heappush
 from itertools import count
+from time import time_ns
 from typing import Any, Protocol, cast
 
-from tfbus._aio.loops import asleep, checkpoint, running_loop, wake_up
+from tfbus._aio.loops import asleep, checkpoint, here, running_loop, wake_up
 from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import SeenKeys
 from tfbus.clock import Clock, SimulatedClock, SystemClock
@@ -64,6 +63,8 @@ class LoopTimer:
     ----------
     due : float
         The time of the next call, in s; infinity if none is set.
+    now : callable
+        Gives the time of the loop, in s, while the loop runs.
     """
 
     def __init__(self, loop: Any, callback: Callable[[], object]) -> None:
@@ -72,10 +73,8 @@ class LoopTimer:
         self._callback = callback
         self._trio = None if hasattr(loop, "call_at") else cast(Any, sys.modules["trio"])
         self._handle: Any = None
-
-    def now(self) -> float:
-        """The time of the loop, in s, while the loop runs."""
-        return float(self.loop.time() if self._trio is None else self._trio.current_time())
+        clock = None if self._trio is None else self._trio.lowlevel.current_clock()
+        self.now: Callable[[], float] = loop.time if clock is None else clock.current_time
 
     def set(self, due: float) -> None:
         """Call the function at a time, in s; a time that was set before no longer counts."""
@@ -165,6 +164,9 @@ _CANCELLED_KEPT = 64
 Cancel = Callable[[], object]
 """Cancels a call, if it has not been made."""
 
+CallAfter = Callable[[float, Callable[[], object]], Cancel]
+"""Calls a function on an event loop after a duration in s, unless it is cancelled; the function must not raise."""
+
 
 def _nothing() -> None:
     """Cancel nothing."""
@@ -173,8 +175,8 @@ def _nothing() -> None:
 class Alarms(Protocol):
     """Calls functions after a duration on some clock."""
 
-    def call_after(self, seconds: float, callback: Callable[[], object]) -> Cancel:
-        """Call a function on the event loop after a duration in s, unless it is cancelled; it must not raise."""
+    def on(self, loop: Any) -> CallAfter:
+        """The alarms on the running event loop, as `running_loop` gives it."""
 
 
 def alarms_of(clock: Clock) -> Alarms | None:
@@ -191,9 +193,9 @@ class SimulatedAlarms:
     def __init__(self, clock: SimulatedClock) -> None:
         self._clock = clock
 
-    def call_after(self, seconds: float, callback: Callable[[], object]) -> Cancel:
-        """Call a function after a simulated duration in s, unless it is cancelled; it must not raise."""
-        return self._clock.call_after(seconds, callback).close
+    def on(self, loop: Any) -> CallAfter:  # noqa: ARG002 - simulated time is the same on every loop
+        """Alarms after simulated durations."""
+        return lambda seconds, callback: self._clock.call_after(seconds, callback).close
 
 
 class LoopAlarms:
@@ -202,14 +204,12 @@ class LoopAlarms:
     def __init__(self) -> None:
         self._heap: AlarmHeap | None = None
 
-    def call_after(self, seconds: float, callback: Callable[[], object]) -> Cancel:
-        """Call a function on the event loop after a duration in s, unless it is cancelled; it must not raise."""
-        loop = running_loop()
-        heap = self._heap
-        if heap is None or heap.timer.loop is not loop:
+    def on(self, loop: Any) -> CallAfter:
+        """The alarms on the running event loop, as `running_loop` gives it."""
+        if self._heap is None or self._heap.timer.loop is not loop:
             # The heap of another loop still wakes the lookups that wait there.
-            heap = self._heap = AlarmHeap(loop)
-        return heap.add(seconds, callback)
+            self._heap = AlarmHeap(loop)
+        return self._heap.add
 
 
 class AlarmHeap:
@@ -217,36 +217,37 @@ class AlarmHeap:
 
     def __init__(self, loop: Any) -> None:
         self.timer = LoopTimer(loop, self._ring)
-        self._alarms: list[tuple[float, int]] = []
-        # The callbacks that are neither made nor cancelled, by number.
-        self._callbacks: dict[int, Callable[[], object]] = {}
+        self._now = self.timer.now
+        # With a list of the callback, which is empty once the call is made or cancelled.
+        self._alarms: list[tuple[float, int, list[Callable[[], object]]]] = []
+        self._most = _CANCELLED_KEPT
         self._numbers = count()
 
     def __len__(self) -> int:
         return len(self._alarms)
 
     def add(self, seconds: float, callback: Callable[[], object]) -> Cancel:
-        due = self.timer.now() + seconds
-        number = next(self._numbers)
-        callbacks = self._callbacks
-        callbacks[number] = callback
-        if len(self._alarms) > 2 * len(callbacks) + _CANCELLED_KEPT:
-            self._alarms = [alarm for alarm in self._alarms if alarm[1] in callbacks]
-            heapify(self._alarms)
-        heappush(self._alarms, (due, number))
+        due = self._now() + seconds
+        alarms = self._alarms
+        if len(alarms) > self._most:
+            alarms[:] = [alarm for alarm in alarms if alarm[2]]
+            heapify(alarms)
+            self._most = 2 * len(alarms) + _CANCELLED_KEPT
+        made = [callback]
+        heappush(alarms, (due, next(self._numbers), made))
         if due < self.timer.due:
             self.timer.set(due)
         # No function of Python, because nearly every wait cancels its alarms before it gives its answer.
-        return partial(callbacks.pop, number, None)
+        return made.clear
 
     def _ring(self) -> None:
         """Make the calls that are due, and set the timer for the next."""
         now = self.timer.now()
         try:
-            while self._alarms and (self._alarms[0][0] <= now or self._alarms[0][1] not in self._callbacks):
-                callback = self._callbacks.pop(heappop(self._alarms)[1], None)
-                if callback is not None:
-                    callback()
+            while self._alarms and (self._alarms[0][0] <= now or not self._alarms[0][2]):
+                made = heappop(self._alarms)[2]
+                if made:
+                    made.pop()()
         finally:
             if self._alarms and self._alarms[0][0] < self.timer.due:
                 self.timer.set(self._alarms[0][0])
@@ -339,7 +340,6 @@ class Wait(Waiter):
 
     sleep: Generator[Any, None, None]
     expired = False
-    cancel_end: Cancel | None = None
 
     def expire(self) -> None:
         """End the wait."""
@@ -365,6 +365,8 @@ class Lookups:
     ----------
     forest : Forest
         The forest that answers.
+    now : callable
+        The bus's clock, in ns.
     feed : Feed or None
         Asks for this buffer, and parks its lookups; only the compiled kernel has one.
     """
@@ -379,7 +381,8 @@ class Lookups:
         self.forest = share.live.forest
         self.bus = bus
         self._clock = bus.clock
-        self._now = bus.clock.now
+        # One call less, as each wait notes when it began.
+        self.now = time_ns if type(bus.clock) is SystemClock else bus.clock.now
         self._is_here = bus._is_here
         self._local_names = local_names
         self._alarms = alarms_of(bus.clock)
@@ -387,9 +390,9 @@ class Lookups:
         # The loop on which the next look at the lookups that hang is due, if one is, and the function that cancels it.
         self._looking_on: Any = None
         self._cancel_look: Cancel = _nothing
-        self.feed = share.live.make_feed()
+        self.feed = share.feed
         if self.feed is not None:
-            self.feed.kind, self.feed.begin = Wait, self.begin
+            self.feed.kind, self.feed.here, self.feed.begin = Wait, here, self.begin
 
     @property
     def has_alarms(self) -> bool:
@@ -452,7 +455,7 @@ class Lookups:
         patience = math.inf if timeout is None else as_duration(timeout, "timeout")
         last_reset = self.share.live.last_reset
         await checkpoint()
-        wait = Wait(question, self._now(), _nothing)
+        wait = Wait(question, self.now(), _nothing)
         wait.others, wait.patience = others, patience
         return await self.go_on(wait, last_reset)
 
@@ -481,28 +484,22 @@ class Lookups:
         finally:
             self.end(wait)
 
-    def begin(self, wait: Wait, on_asyncio: bool) -> Generator[Any, None, None] | None:
-        """The sleep of a lookup that the kernel is about to park; None if it must not. Called by the kernel."""
-        if self.share.end_reason is not None or wait.patience == 0.0:
+    def begin(self, wait: Wait) -> Generator[Any, None, None] | None:
+        """The sleep of a lookup that the kernel is about to park; None if it must not. Called by the kernel.
+
+        On the loop that runs now, the kernel then does the same without this method.
+        """
+        if self.share.end_reason is not None or wait.patience == 0.0 or self._alarms is None:
             return None
-        wait.share = self.share
-        if on_asyncio:
-            # As `wake_up`, which takes twice as long to call.
-            loop = get_running_loop()
-            future = loop.create_future()
-            wait.wake = partial(future.set_result, None)
-            sleep = future.__await__()
-        else:
-            loop = running_loop()
-            sleep, wait.wake = wake_up(loop)
-        wait.since = self._now()
+        loop = running_loop()
         if self._looking_on is not loop:
-            # Else this thread has been checked.
             if not self._is_here():
                 return None
             self._look_after(REPORT_AFTER)
-        if wait.patience < math.inf:
-            self._set_end(wait)
+        wait.share, wait.since = self.share, self.now()
+        sleep, wait.wake = wake_up(loop)
+        self._set_end(wait, loop)
+        self.feed.loop, self.feed.call_after = loop, self._alarms.on(loop)
         return sleep
 
     def end(self, wait: Wait) -> None:
@@ -573,25 +570,28 @@ class Lookups:
         """The sleep of a lookup, with a new wake-up. Its alarms are set the first time."""
         loop = running_loop()
         sleep, wait.wake = wake_up(loop)
-        if self._looking_on is not loop and self._alarms is not None:
-            self._look_after(max(REPORT_AFTER - to_seconds(self._now() - wait.since), 0.0))
-        self._set_end(wait)
-        return sleep
-
-    def _set_end(self, wait: Wait) -> None:
-        """Set the alarm for the end of a wait, if it has an end and no alarm."""
-        if wait.patience < math.inf and wait.cancel_end is None and self._alarms is not None:
+        if self._alarms is not None:
+            if self._looking_on is not loop:
+                self._look_after(max(REPORT_AFTER - to_seconds(self.now() - wait.since), 0.0))
             if wait.patience == 0.0:
                 wait.expired = True
             else:
-                wait.cancel_end = self._alarms.call_after(wait.patience, wait.expire)
+                self._set_end(wait, loop)
+        return sleep
+
+    def _set_end(self, wait: Wait, loop: Any) -> None:
+        """Set the alarm for the end of a wait, if it has an end and no alarm."""
+        if wait.patience < math.inf and wait.cancel_end is None and self._alarms is not None:
+            wait.cancel_end = self._alarms.on(loop)(wait.patience, wait.expire)
 
     def _look_after(self, pause: float) -> None:
         """Look at the lookups that hang after some time (s), unless that is infinite."""
         self._cancel_look()
+        if self.feed is not None:
+            self.feed.loop = None
         if pause < math.inf and self._alarms is not None:
-            self._looking_on = running_loop()
-            self._cancel_look = self._alarms.call_after(pause, lambda: self._look_after(self.report()))
+            self._looking_on = loop = running_loop()
+            self._cancel_look = self._alarms.on(loop)(pause, lambda: self._look_after(self.report()))
         else:
             self._looking_on, self._cancel_look = None, _nothing
 

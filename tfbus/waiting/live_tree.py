@@ -27,7 +27,6 @@ wake a waiter is to call the function that it brought along: nothing here knows 
 """
 
 import logging
-import math
 from bisect import bisect_left, insort
 from collections.abc import Callable, Container, Hashable, Iterable, KeysView
 from dataclasses import astuple, dataclass
@@ -162,10 +161,6 @@ class Waiter(Parked):
     ----------
     others : tuple of Question
         Further questions that need an answer: the waiter is woken when one of them can no longer have an answer.
-    share : Share or None
-        The share of the buffer that asks.
-    patience : float
-        How long it waits at most, in s.
     blocked_by : TransformLookupError or None
         The error with which it was parked; None if the kernel has parked it, because newer samples are all it lacks.
     limits : list of (str, Place)
@@ -175,8 +170,6 @@ class Waiter(Parked):
     """
 
     others: tuple[Question, ...] = ()
-    share: "Share | None" = None
-    patience = math.inf
     blocked_by: TransformLookupError | None = None
     limits: list[tuple[str, Place]] | None = None
     indexed = False
@@ -677,11 +670,16 @@ class Share:
     live : LiveTree
     end_reason : str or None
         The reason why no more samples will come; None while they may.
+    feed : Feed or None
+        Asks for this buffer, and parks its lookups; only the compiled kernel has one.
     """
 
     def __init__(self, live: LiveTree, before: BufferStatistics) -> None:
         self.live = live
         self.end_reason: str | None = None
+        self.feed = live.make_feed()
+        if self.feed is not None:
+            self.feed.share = self
         self._end_callbacks: dict[Registration, Callable[[], object]] = {}
         self._before = before
 
@@ -704,6 +702,8 @@ class Share:
         """Wake the waiting lookups and watches for the last time; only the first reason counts."""
         if self.end_reason is None:
             self.end_reason = reason
+        if self.feed is not None:
+            self.feed.loop = None
         waiters = self.waiters
         for waiter in waiters:
             self.live.waiting.remove(waiter)
