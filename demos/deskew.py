@@ -60,10 +60,10 @@ async def main() -> None:
                 cloud = scan_the_wall(0.0).to_points()
                 assert cloud.stamps is not None
                 newest = int(cloud.stamps.max())
-                await buffer.lookup("odom", cloud.frame, newest, timeout=1.0)
+                deskewed = await buffer.deskew(cloud, "odom", fixed="odom", timeout=1.0)
                 print(f"the transform of the last ray came {tfbus.to_seconds(clock.now() - newest) * 1000:.0f} ms late")
                 show("all rays at one instant", await buffer.transform(cloud, "odom"))
-                show("each ray at its own", buffer.tree.deskew(cloud, "odom", fixed="odom"))
+                show("each ray at its own", deskewed)
                 ahead = tfbus.PointStamped("laser", 0, (WALL, 0.0, 0.0))
                 now = await buffer.transform(ahead, "laser", at=newest, fixed="odom")
                 print(f"seen straight ahead at first, and by now at ({now.point[0]:.3f}, {now.point[1]:.3f})")

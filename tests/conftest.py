@@ -128,7 +128,7 @@ def is_on_another_loop(item: pytest.Item) -> bool:
     """Whether an item runs a test on a loop that is not for the default suite."""
     parameters = item.callspec.params if hasattr(item, "callspec") else {}
     every_loop = item.get_closest_marker("every_loop") is not None
-    return not every_loop and parameters.get("anyio_backend", ASYNCIO) != ASYNCIO
+    return not every_loop and parameters.get("anyio_backend", ASYNCIO) not in (ASYNCIO, "asyncio")
 
 
 @contextmanager

@@ -4,7 +4,7 @@ import inspect
 import logging
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,6 +22,7 @@ from tfbus import (
     FutureExtrapolationError,
     LocalLink,
     LookupTimeoutError,
+    MessageFilter,
     PastExtrapolationError,
     PointStamped,
     SimulatedClock,
@@ -243,7 +244,30 @@ def test_the_names_of_tf2_make_no_access_to_an_attribute_slower(kind: type) -> N
     assert inspect.getattr_static(kind, "__getattr__", None) is None
 
 
-@pytest.mark.parametrize("make", [LocalLink, lambda bus: Recorder(bus, "run.mcap")])
+async def no_messages() -> AsyncIterator[PointStamped]:
+    for message in list[PointStamped]():
+        yield message
+
+
+@pytest.mark.anyio
+async def test_the_tolerance_of_a_message_filter_is_its_margin_and_warns() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        with pytest.warns(DeprecationWarning, match="the tolerance of a MessageFilter is called margin"):
+            old = MessageFilter(no_messages(), buffer, "map", tolerance=0.2)
+        with pytest.raises(ValueError, match="margin must not be negative"):
+            MessageFilter(no_messages(), buffer, "map", margin=-1.0)
+        async with old as pairs:
+            assert [pair async for pair in pairs] == []
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        LocalLink,
+        lambda bus: Recorder(bus, "run.mcap"),
+        lambda bus: MessageFilter(no_messages(), Buffer(bus), "map"),
+    ],
+)
 def test_a_plain_with_of_something_that_owns_a_task_says_async_with(make: Callable[[Bus], Any]) -> None:
     with Bus() as bus:
         thing = make(bus)

@@ -83,6 +83,7 @@ def test_the_first_alternative_that_can_be_read_holds() -> None:
         ({"at": "latest"}, "Outer.at cannot be 'latest'"),
         ({"at": True}, "Outer.at cannot be True"),
         ({"share": "0.5"}, "Outer.share cannot be '0.5'"),
+        ({"share": 10**400}, "an integer of 1329 bits is too large for a float"),
         ({"flag": 1}, "Outer.flag cannot be 1"),
         ({"parts": {}}, "Outer.parts cannot be {}"),
         ({"parts": [5]}, r"Outer.parts\[0\] cannot be 5"),

@@ -77,6 +77,7 @@ _NAMES_IN = {
     "geometry.transform_array": ("TransformArray",),
     "links.local.local_link": ("LocalLink",),
     "message_filter.message_filter": ("MessageFilter",),
+    "recording.static_frames": ("load_static", "save_static"),
     "registration": ("Registration",),
     "robot.model": ("Joint", "LimitViolation", "Mimic", "RobotModel"),
     "robot.state_publisher": ("RobotStatePublisher",),

@@ -72,6 +72,8 @@ from tfbus.geometry.transform import Transform as Transform
 from tfbus.geometry.transform_array import TransformArray as TransformArray
 from tfbus.links.local.local_link import LocalLink as LocalLink
 from tfbus.message_filter.message_filter import MessageFilter as MessageFilter
+from tfbus.recording.static_frames import load_static as load_static
+from tfbus.recording.static_frames import save_static as save_static
 from tfbus.registration import Registration as Registration
 from tfbus.robot.model import Joint as Joint
 from tfbus.robot.model import LimitViolation as LimitViolation

@@ -6,8 +6,10 @@ Build it with ``sphinx-build -W -n -b html demos/guide "$(mktemp -d)"``; nothing
 import importlib
 import inspect
 import re
+from collections import Counter
 from collections.abc import Iterator
 from importlib.metadata import version as version_of
+from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy.typing as npt
@@ -16,6 +18,8 @@ from docutils.nodes import Element, TextElement
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
+
+from tfbus.cli.application import COMMANDS, application
 
 ScalarT = TypeVar("ScalarT")
 
@@ -75,6 +79,9 @@ html_css_files = ["wide.css"]
 html_copy_source = False
 html_show_copyright = False
 html_theme_options = {"navigation_with_keys": True}
+
+# It would make one dash of the two before an option.
+smartquotes = False
 
 # The anchors that GitHub gives to headings, so that a link works there and here.
 myst_heading_anchors = 3
@@ -155,6 +162,68 @@ def find(dotted: str) -> object:
 
 WORDS = frozenset(words())
 
+GUIDE = Path(__file__).parent
+DEMOS = sorted(GUIDE.parent.glob("*.py"))
+DOMAIN_HEADING = "Options of all commands that join a domain"
+
+
+def complete(app: Sphinx, name: str, source: list[str]) -> None:  # noqa: ARG001 - Sphinx names the arguments
+    """Add to a page what is made from the code; links to demos lead to the page of demos."""
+    if name in MADE:
+        source[0] += MADE[name]()
+    else:
+        source[0] = re.sub(r"\]\(\.\./(\w+)\.py\)", r"](demos.md#\1py)", source[0])
+
+
+def demos() -> str:
+    """All demos, one after another."""
+    return "".join(f"\n## {path.name}\n\n```{{literalinclude}} ../{path.name}\n```\n" for path in DEMOS)
+
+
+def commands() -> str:
+    """The options of all commands; those that most commands have are told once."""
+    pages = {name: command_page(name) for name in COMMANDS}
+    bullet = re.compile(r"^\* `--.*\n(?:    .*\n)*", re.MULTILINE)
+    counts = Counter(line for page in pages.values() for line in bullet.findall(page))
+    shared = [line for line, count in counts.items() if count > len(COMMANDS) / 2]
+    for name, page in pages.items():
+        own = bullet.sub(lambda found: "" if found[0] in shared else found[0], page)
+        if own != page:
+            # A heading of options may have none left.
+            own = re.sub(r"\n\*\*[^*\n]+\*\*:\n\s*(?=\n\*\*|\Z)", "\n", own)
+            own += f"\nIt joins a domain: see [{DOMAIN_HEADING}](#{DOMAIN_HEADING.lower().replace(' ', '-')}).\n"
+        pages[name] = own
+    return "\n".join([*pages.values(), f"## {DOMAIN_HEADING}\n", "".join(shared)])
+
+
+def command_page(name: str) -> str:
+    """The help of a command as Markdown."""
+    text: str = application(name)[name].generate_docs("markdown", heading_level=2)
+    # The command line shows neither an option that empties another one, nor a default that is nothing.
+    text = re.sub(r", --empty-[\w-]+(?=`:)| \*\[default: (?:False|\(\)|\"\")\]\*", "", text)
+    text = re.sub(r"^Example: (.*)$", r"```console\n\1\n```", text, flags=re.MULTILINE)
+    return "\n" + text.replace(f"## {name}", f"## tfbus {name}", 1).replace(f"\n{name} ", f"\ntfbus {name} ", 1)
+
+
+def summaries() -> str:
+    """A line for each name of the reference, page by page."""
+    parts = []
+    for page in re.findall(r"^   (\w+)$", (GUIDE / "reference" / "index.rst").read_text(), re.MULTILINE):
+        text = (GUIDE / "reference" / f"{page}.rst").read_text()
+        title = text.partition("\n")[0]
+        lines = []
+        for kind, name in re.findall(r"^\.\. auto(\w+):: (tfbus[\w.]+)", text, re.MULTILINE):
+            # The docstring of data is the one of their type.
+            summary = "" if kind == "data" else (inspect.getdoc(find(name)) or "").partition("\n\n")[0]
+            summary = re.sub(r"(?<!`)`([^`]+)`(?!`)", r"``\1``", " ".join(summary.split()))
+            lines.append(f"* :obj:`{name}`" + (f": {summary}" if summary else ""))
+        title = f":doc:`{title} <{page}>`"
+        parts.append(f"{title}\n{'-' * len(title)}\n\n" + "\n".join(lines) + "\n")
+    return "\n\n" + "\n".join(parts)
+
+
+MADE = {"commands": commands, "demos": demos, "reference/index": summaries}
+
 
 def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: TextElement) -> Element | None:
     """The target of a name that the reference has under another name, or not at all.
@@ -185,3 +254,4 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: Tex
 
 def setup(app: Sphinx) -> None:
     app.connect("missing-reference", resolve)
+    app.connect("source-read", complete)

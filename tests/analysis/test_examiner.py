@@ -85,6 +85,7 @@ BOXES += [moving("b", "box", k * 100 * MS, 500.0) for k in range(30, 60)]
             {},
             {("static changes", "arm"): (2, 2, None, None)},
         ),
+        ([static("base", "arm", 1e9)], {}, {("translation", "arm"): (1, None, 1e9, None)}),
         (
             [static("odom", "base", authority="odometry"), *drive(5)],
             {},

@@ -271,6 +271,40 @@ def test_a_chain_of_ten_thousand_frames(table: Table) -> None:
     table.add("reparent the leaf at its end", show(reparenting, "us"), wanted="<= 100 us")
 
 
+@pytest.mark.parametrize("frames", [10_000, 100_000])
+def test_many_frames_at_once(table: Table, frames: int) -> None:
+    """Each is one call, so the event loop does nothing else meanwhile."""
+    children = [f"f{i}" for i in range(frames)]
+    parents = [f"p{i // 10}" for i in range(frames)]
+    poses = np.zeros((frames, 3)), np.tile(Transform().rotation, (frames, 1))
+    clock = tfbus.SimulatedClock(START)
+    with Bus(clock, max_behind=None) as fixed, Bus(clock) as moving, Buffer(moving):
+        fixed.publish_columns(parents, children, START, *poses, AUTHORITY, static=True)
+
+        def closed_after(call: Callable[[], Any]) -> float:
+            start = perf_counter()
+            opened = call()
+            seconds = perf_counter() - start
+            opened.close()
+            return seconds
+
+        def jump_back() -> float:
+            clock.set(START)
+            moving.publish_columns(parents, children, START, *poses, AUTHORITY)
+            start = perf_counter()
+            clock.set(START - 1)
+            return perf_counter() - start
+
+        sides = (lambda: closed_after(lambda: Buffer(fixed)), jump_back, lambda: closed_after(fixed.events))
+        joining, jumping, opening = take_turns(*sides, rounds=FEW_ROUNDS)
+    for label, seconds in (
+        (f"a buffer joins {frames:,} static frames", joining),
+        (f"the clock of {frames:,} moving frames jumps back", jumping),
+        (f"events() of {frames:,} frames opens", opening),
+    ):
+        table.add(label, show(seconds, "ms"), wanted="<= 20 ms")
+
+
 ROBOTS, PARTS = 64, 20
 
 

@@ -282,6 +282,29 @@ def bus_with(*batches: list[TransformStamped]) -> Bus:
     return bus
 
 
+# Latched samples
+
+
+def test_buffers_that_begin_with_the_same_latched_samples_go_on_each_by_itself() -> None:
+    clock = SimulatedClock(100 * SECOND)
+    bus = Bus(clock)
+    bus.publish([static("base", "laser", 1.0), static("base", "imu", 2.0)])
+    closed, short, long = (Buffer(bus, keep) for keep in (1.0, 2.0, 3.0))
+    copied = short.tree.copy()
+    closed.close()
+    assert short.lookup_nowait("laser", "imu").transform.translation == (1.0, 0.0, 0.0)
+    bus.publish([static("base", "laser", 5.0), *over("base", "imu", (90 * SECOND, 92 * SECOND, 93 * SECOND))])
+    late = Buffer(bus, 1.0)
+    assert [x_of(tree.tree, "base", "laser") for tree in (closed, short, long, late)] == [1.0, 5.0, 5.0, 5.0]
+    assert x_of(copied, "base", "laser") == 1.0
+    assert [tree.edges()[0].samples for tree in (closed.tree, short.tree, long.tree)] == [1, 2, 3]
+    assert (closed.tree.parent("imu"), late.tree.frames()) == ("base", ["base", "laser"])
+    clock.set(0)
+    bus.remove_frame("laser")
+    assert (late.tree.frames(), Buffer(bus).tree.frames(), short.tree.frames()) == ([], [], ["base", "imu"])
+    assert x_of(closed.tree, "base", "laser") == 1.0
+
+
 # Superseded samples
 
 

@@ -89,20 +89,6 @@ async def read_along(
 # Changes
 
 
-@pytest.mark.every_loop
-async def test_a_watch_starts_with_the_current_answer_and_then_gives_each_new_one(bus: Bus, buffer: Buffer) -> None:
-    bus.publish([driving("map", "a", 1.0), driving("map", "a", 2.0)])
-    samples = [driving("map", "a", second) for second in (3.0, 4.0, 5.0)]
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "a") as changes:
-            got = await read_along(changes, bus, samples, tasks)
-    assert [(answer.parent, answer.child, answer.stamp) for answer in got] == [
-        ("map", "a", second * SECOND) for second in (2, 3, 4, 5)
-    ]
-    assert [x_of(answer) for answer in got] == [2.0, 3.0, 4.0, 5.0]
-    assert changes.skipped == 0
-
-
 @pytest.mark.parametrize(
     ("before", "after", "angle"),
     [
@@ -295,15 +281,6 @@ async def test_a_gap_delays_answers_until_the_lagging_edge_is_past_it(bus: Bus, 
 
 
 # The end
-
-
-@pytest.mark.parametrize("end", ["buffer", "bus"])
-async def test_a_watch_of_a_closed_buffer_gives_the_current_answer_and_ends(bus: Bus, buffer: Buffer, end: str) -> None:
-    bus.publish(moving("map", "a", 1))
-    (buffer if end == "buffer" else bus).close()
-    assert [answer.stamp async for answer in buffer.watch("map", "a")] == [1]
-    assert [answer async for answer in buffer.watch("map", "unknown")] == []
-    assert buffer.pending() == ()
 
 
 # Jumps

@@ -1,5 +1,6 @@
 """Publishing, authorities, the clock, threads, the end and the statistics of a bus."""
 
+import asyncio
 import gc
 import logging
 import sys
@@ -14,7 +15,7 @@ import anyio.to_thread
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.asking import Asked, driving, settle
+from support.asking import Asked, settle
 from support.samples import any_samples, edges_of, latched, moving, static
 
 from tfbus import (
@@ -23,7 +24,6 @@ from tfbus import (
     BufferStatistics,
     Bus,
     BusClosedError,
-    FutureExtrapolationError,
     InvalidTransformError,
     PastLoop,
     QueueStatistics,
@@ -167,7 +167,7 @@ def test_drop_leaves_out_only_the_rejected_samples_and_logs_them_once(caplog: py
     assert sum("loop" in message for message in caplog.messages) == 1
 
 
-@pytest.mark.parametrize("nonsense", [None, 5, "map", b"map", [moving("map", "a", 1), None], ["map"], {"map": 1}])
+@pytest.mark.parametrize("nonsense", [None, 5, "", b"", "map", [moving("map", "a", 1), None], ["map"], {"map": 1}])
 def test_a_batch_with_an_object_that_is_no_sample_is_refused_whole(bus: Bus, buffer: Buffer, nonsense: object) -> None:
     with pytest.raises(TypeError, match="TransformStamped"):
         bus.publish(nonsense)  # type: ignore[arg-type]
@@ -242,23 +242,6 @@ def test_each_jump_back_is_logged(caplog: pytest.LogCaptureFixture) -> None:
 
 
 # The end
-
-
-async def test_closing_ends_waiting_lookups_and_streams_and_buffers_still_answer(bus: Bus, buffer: Buffer) -> None:
-    bus.publish(driving("map", "a", 1.0))
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 2_000_000_000))
-        with bus.stream() as stream:
-            read = Asked(tasks, stream.__anext__)
-            await settle()
-            bus.close()
-            bus.close()
-            await settle()
-    assert bus.closed
-    assert isinstance(asked.error, BusClosedError)
-    assert isinstance(asked.error.__cause__, FutureExtrapolationError)
-    assert isinstance(read.error, StopAsyncIteration)
-    assert (await buffer.lookup("map", "a")).stamp == 1_000_000_000
 
 
 CALLS: list[Callable[[Bus], object]] = [
@@ -453,6 +436,31 @@ def test_an_interrupt_in_one_buffer_keeps_the_batch_from_no_other_nor_from_a_sub
             logging.getLogger("tfbus").removeFilter(interrupt)
         assert second.can_transform("map", "a", SECOND)
         assert heard == [(late,)]
+
+
+@pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_an_interrupt_of_a_wake_up_is_raised_as_it_is_and_every_buffer_has_the_batch(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch, place: int
+) -> None:
+    loop = asyncio.get_running_loop()
+    call_soon = loop.call_soon
+
+    def interrupted(*arguments: Any, **options: Any) -> None:
+        call_soon(*arguments, **options)
+        raise KeyboardInterrupt
+
+    buffers = Buffer(bus), Buffer(bus)
+    bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffers[place].lookup, "map", "a", 5))
+        await settle()
+        with monkeypatch.context() as patch:
+            patch.setattr(loop, "call_soon", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                bus.publish(moving("map", "a", 5))
+        assert [buffer.lookup_nowait("map", "a").stamp for buffer in buffers] == [5, 5]
+    assert asked.answer.stamp == 5
 
 
 def test_an_unknown_policy_for_conflicts_is_an_error() -> None:

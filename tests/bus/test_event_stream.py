@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import astuple
 
 import anyio
 import pytest
@@ -9,14 +10,20 @@ from support.asking import Asked, settle
 from support.samples import moving, static
 
 from tfbus import (
+    SECOND,
     Bus,
     Event,
     EventStream,
     FrameAdded,
+    FrameLive,
+    FrameRemoved,
+    FrameStale,
     InvalidTransformError,
     PastLoop,
     QueueStatistics,
+    Reparented,
     SampleRejected,
+    SimulatedClock,
     StampAhead,
 )
 from tfbus.bus.event_stream import EventQueue
@@ -37,7 +44,41 @@ async def test_events_that_a_slow_reader_misses_are_counted_in_the_statistics(bu
     assert bus.statistics().queues == ()
 
 
+# The beginning
+
+
+async def test_the_first_events_tell_of_the_moment_at_which_the_stream_was_opened(bus: Bus) -> None:
+    bus.publish([static("map", "a"), static("map", "b")])
+    with bus.events() as events:
+        bus.publish(static("odom", "a"))
+        bus.remove_frame("b")
+        assert bus.statistics().queues[0].pending == 4
+        found = [await anext(events) for _ in range(4)]
+    assert [(type(event), getattr(event, "frame", None), getattr(event, "parent", None)) for event in found] == [
+        (FrameAdded, "a", "map"),
+        (FrameAdded, "b", "map"),
+        (Reparented, "a", "odom"),
+        (FrameRemoved, "b", None),
+    ]
+
+
 # Stale and live
+
+
+async def test_ten_thousand_frames_that_turn_stale_at_once_are_told_of_in_the_order_of_their_names() -> None:
+    clock = SimulatedClock(10 * SECOND)
+    bus = Bus(clock)
+    names = [f"f{number:05}" for number in range(10_000)]
+    bus.publish([moving("map", name, 9 * SECOND) for name in reversed(names)])
+    with bus.events() as events:
+        clock.set(10 * SECOND + 1)
+        found = [await anext(events) for _ in range(2 * len(names))]
+        assert [event.frame for event in found if isinstance(event, FrameAdded)] == names[::-1]
+        assert [event.frame for event in found if isinstance(event, FrameStale)] == names
+        bus.publish([moving("map", name, 10 * SECOND) for name in names])
+        assert [await anext(events) for _ in names] == [
+            FrameLive(clock.now(), name, clock.now() - 1, "") for name in names
+        ]
 
 
 # The end
@@ -102,7 +143,7 @@ def added(frame: str) -> FrameAdded:
 
 def test_an_initial_event_of_a_frame_ahead_of_the_clock_is_given_once() -> None:
     ahead = StampAhead(1, "a", 10**9, "x")
-    queue = EventQueue(10, [added("a"), ahead])
+    queue = EventQueue(10, [astuple(added("a"))], [ahead])
     queue.put(StampAhead(2, "a", 2 * 10**9, "x"))
     assert emptied(queue) == [added("a"), ahead]
     queue.put(StampAhead(3, "a", 10**9, "y"))

@@ -85,19 +85,6 @@ def test_of_several_edges_of_others_the_one_that_was_published_last_is_removed(b
     ]
 
 
-@pytest.mark.parametrize("last", ["a", "map"])
-@pytest.mark.parametrize("elsewhere", [False, True])
-def test_of_two_edges_of_others_the_one_that_came_last_is_removed(bus: Bus, last: str, elsewhere: bool) -> None:
-    if elsewhere:
-        bus.publish([moving("x", "a", 0, authority="one"), moving("x", "map", 0, authority="two")])
-    edges = {"a": moving("base", "a", 0, authority="one"), "map": moving("a", "map", 0, authority="two")}
-    for child in sorted(edges, key=last.__eq__):
-        bus.publish(edges[child])
-    with bus.reserve("base", "owner"):
-        TransformBroadcaster(bus, "owner").send("map", "base", Transform())
-    assert {event.frame for event in edges_of(bus)} == {"base", "a", "map"} - {last}
-
-
 def test_of_one_batch_the_edge_of_the_other_is_left_out() -> None:
     bus = Bus(SimulatedClock())
     batch = [moving("base", "map", 1, authority="stranger"), moving("map", "base", 1, authority="owner")]

@@ -1,6 +1,7 @@
 """Publishing from threads, and what else threads may do with a bus."""
 
 import asyncio
+import math
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
@@ -22,6 +23,8 @@ from tfbus import (
     PointStamped,
     SimulatedClock,
     ThreadPublisher,
+    Transform,
+    TransformBroadcaster,
     TransformStamped,
 )
 
@@ -74,6 +77,32 @@ async def test_a_thread_wakes_a_lookup_on_a_loop_that_has_nothing_else_to_do(bus
             await settle()
             assert in_thread(lambda: publish([moving("map", "a", 4, 4.0), moving("map", "a", 6, 6.0)])) == []
         assert asked.answer.transform.translation == (5.0, 0.0, 0.0)
+
+
+async def test_a_broadcaster_sends_from_a_thread_as_on_the_loop(bus: Bus, buffer: Buffer) -> None:
+    got: list[TransformStamped] = []
+    bus.subscribe(got.extend)
+    with bus.threadsafe() as publish:
+        driver = TransformBroadcaster(publish, "driver", prefix="r1/", shared={"map"})
+
+        def drive() -> None:
+            driver.send("map", "base", Transform((1.0, 0.0, 0.0)), at=5)
+            driver.send_static("base", "laser", Transform())
+            driver.send_all([("base", "arm", Transform()), ("base", "head", Transform())], at=6)
+            driver.send_columns("map", "cart", [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]] * 2, [5, 6])
+            # Only the bus knows that this one closes a loop.
+            driver.send("laser", "map", Transform(), at=5)
+
+        assert in_thread(drive) == []
+        with anyio.fail_after(PATIENCE):
+            await buffer.lookup("map", "r1/cart", 6)
+        assert driver.bus is bus
+    assert [(sample.child, sample.authority) for sample in got] == [
+        (f"r1/{child}", "driver") for child in ("base", "laser", "arm", "head", "cart", "cart")
+    ]
+    assert bus.statistics().rejected == {"cycle": 1}
+    wrong = in_thread(lambda: driver.send_columns("map", "cart", [[math.nan] * 3], [[0.0, 0.0, 0.0, 1.0]], 5))
+    assert [type(error) for error in wrong] == [InvalidTransformError]
 
 
 async def test_the_samples_of_each_thread_arrive_in_order_and_without_loss(bus: Bus) -> None:

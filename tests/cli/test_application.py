@@ -59,6 +59,13 @@ def test_the_help_of_a_command_has_an_example_and_the_defaults_that_do_something
     assert max(map(len, done.stdout.splitlines())) <= 80
 
 
+def test_the_help_of_a_command_has_its_own_options_before_those_of_others_in_panels(tfbus: Command) -> None:
+    text = tfbus("check", "--help").stdout
+    order = ["Arguments", "WHAT", "Parameters", "--max-speed", "--json", "What to read", "--topic", "How to join"]
+    places = [text.index(word, text.index("╭")) for word in (*order, "--domain STR", "Options of all commands")]
+    assert places == sorted(places)
+
+
 @pytest.mark.parametrize("columns", [60, 80, 200])
 def test_the_help_of_all_lists_the_commands_as_wide_as_the_terminal(
     columns: int, tfbus: Command, monkeypatch: pytest.MonkeyPatch

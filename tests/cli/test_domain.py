@@ -17,20 +17,12 @@ import pytest
 from support.asking import settle
 from support.both_sides import URDF
 from support.commands import START, Command, check_wrong_call
-from support.processes import PATIENCE, new_domain, start_tfbus
+from support.processes import PATIENCE, new_dds_domain, new_domain, start_tfbus
 from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, ClockResetError, LocalLink, SimulatedClock, TransformStamped, from_seconds
 from tfbus.cli.arguments import UsageError
-from tfbus.cli.domain import (
-    LinkOptions,
-    RemoteLookups,
-    ReplayClock,
-    is_ros,
-    publish_static,
-    ros_link,
-    run,
-)
+from tfbus.cli.domain import LinkOptions, RemoteLookups, ReplayClock, is_ros, publish_static, ros_link, run
 from tfbus.links import BufferServer
 from tfbus.testing import simulate
 
@@ -61,29 +53,17 @@ def test_a_program_asks_the_buffer_of_a_robot_and_of_one_robot_only() -> None:
         LinkOptions(domain, robots=("r1", "r2")).run_remote(serve_and_ask)
 
 
-NO_ADDRESSES = (
-    "7447 127.0.0.1:7447 foo/127.0.0.1:7447 tcp tcp/ tcp/:7447 tcp/127.0.0.1 tcp/::1:7447 tcp/127.0.0.1: "
-    "tcp/127.0.0.1:x tcp/127.0.0.1:65536 tcp//127.0.0.1:7447"
-)
-
-
-@pytest.mark.parametrize("address", ["", "tcp/127.0.0.1:7447 ", *NO_ADDRESSES.split()])
-def test_an_address_that_no_program_can_have_is_a_usage_error(address: str) -> None:
-    with pytest.raises(UsageError, match=f"an address is like tcp/.+, not {re.escape(repr(address))}"):
-        join(LinkOptions(new_domain(), connect=(address,)))
-
-
 def test_an_address_of_any_protocol_is_tried_in_the_background() -> None:
     tcp = ("tcp/127.0.0.1:1", "tcp/127.0.0.1:1?prio=1-7", "tcp/[::1]:1", "ws/127.0.0.1:1", "udp/localhost:1")
     others = ("tls/localhost:1#root_ca_certificate=/nowhere/ca.pem", "unixsock-stream//nowhere/at/all")
     join(LinkOptions(new_domain(), connect=tcp + others))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_an_address_in_use_is_a_usage_error(backend: str, tfbus: Command) -> None:
+@pytest.mark.parametrize("command", ["tree", "tree --backend trio", "router"])
+def test_an_address_in_use_is_a_usage_error(command: str, tfbus: Command) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"tcp/127.0.0.1:{server.getsockname()[1]}"
-        done = tfbus("tree", "--listen", address, "--backend", backend)
+        done = tfbus(*command.split(), "--listen", address)
     check_wrong_call(done, f"cannot listen at {address}: {os.strerror(errno.EADDRINUSE)}")
 
 
@@ -321,6 +301,33 @@ def test_what_is_no_place_of_ros_is_a_usage_error(place: str, why: str) -> None:
         pytest.importorskip(extra)
     with pytest.raises(UsageError, match=why):
         ros_link(Bus(), place)
+
+
+def test_the_topics_and_the_prefix_of_a_robot_in_a_namespace_are_given_to_every_place() -> None:
+    pytest.importorskip("cyclonedds")
+    from support.dds import DdsNode
+
+    domain_number = new_dds_domain()
+    options = LinkOptions(ros=(f"dds:{domain_number}",), tf=("/robot1/tf",), tf_prefix="robot1/")
+
+    async def hear(bus: Bus) -> set[str]:
+        with Buffer(bus) as buffer, DdsNode(domain_number) as node:
+            node.say(static("base", "laser"), topic="rt/robot1/tf_static")
+            node.writer("rt/robot1/tf")
+            await buffer.lookup("robot1/base", "robot1/laser", timeout=PATIENCE)
+            # The moving ones are not latched.
+            while not buffer.can_transform("robot1/map", "robot1/base"):
+                node.say(moving("map", "base", SECOND), topic="rt/robot1/tf")
+                node.say(moving("map", "other", SECOND), topic="rt/tf")
+                await anyio.sleep(0.02)
+            return set(buffer.tree.frames())
+
+    assert options.run(hear) == {"robot1/map", "robot1/base", "robot1/laser"}
+    for wrong in (LinkOptions(tf=("/a/tf",)), LinkOptions(tf_prefix="a/")):
+        with pytest.raises(UsageError, match="--tf and --tf-prefix are for ROS"):
+            join(wrong)
+    with pytest.raises(UsageError, match="cannot be the name of a topic"):
+        join(replace(options, tf=("/a b/tf",)))
 
 
 @pytest.mark.thorough

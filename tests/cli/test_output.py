@@ -31,19 +31,9 @@ from tfbus.cli.output import (
     table_lines,
     terminal_width,
     track,
-    warn,
     wrapped,
     write_file,
 )
-
-
-def test_results_go_to_standard_output_and_everything_else_to_standard_error(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    print_now("a result")
-    say("a notice")
-    warn("a warning")
-    assert capsys.readouterr() == ("a result\n", "a notice\ntfbus: a warning\n")
 
 
 class Screen(io.StringIO):

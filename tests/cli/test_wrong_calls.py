@@ -28,7 +28,18 @@ NEEDS = {"plot": "matplotlib", "view": "viser", "foxglove": "foxglove", "robot":
         ("listen --backend curio", "--backend"),
         ("listen --log-level loud", "--log-level"),
         ("broadcast --listen rubbish", "an address is like tcp/192.168.1.5:7447, not 'rubbish'"),
-        ("router --listen 7447", "an address is like tcp/"),
+        *(
+            (f"router --listen {address}", "an address is like tcp/")
+            for address in (
+                "7447",
+                "foo/127.0.0.1:7447",
+                "tcp/:7447",
+                "tcp/::1:7447",
+                "tcp/a:x",
+                "tcp/a:65536",
+                "tcp//a:1",
+            )
+        ),
         ("static map odom --domain 'a b'", "a domain is made of letters"),
         # The commands of tf2
         ("view_frames", "tf2's view_frames is `tfbus tree`"),
@@ -61,6 +72,10 @@ NEEDS = {"plot": "matplotlib", "view": "viser", "foxglove": "foxglove", "robot":
         *((f"{words}", "there is no such file") for words in ("query no.mcap a b", "check no.mcap", "view no.mcap")),
         ("info arm.urdf", "recording 'arm.urdf': it is not a recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)"),
         ("check yard --from 1", "there is no file 'yard'"),
+        ("check --from 1", "--from and --to are for recordings, and none is given"),
+        ("check yard --ros dds", "--ros joins ROS in place of a domain: leave 'yard' out"),
+        ("tree run.mcap --watch", "--watch and --duration are for a domain"),
+        ("tree --tf /robot1/tf", "--tf and --tf-prefix are for ROS: give --ros, such as --ros dds"),
         ("play run.mcap --from=-1", "expected a time from the beginning on"),
         ("play run.mcap --from 10.1", "is 10.000 s long"),
         ("play run.mcap --from 5 --to 4.9", "--to must not be before --from"),

@@ -4,22 +4,18 @@ import copy
 import json
 import math
 import pickle
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
-from support.samples import moving
 from support.strategies import samples
 
 from tfbus import LATEST, InvalidTransformError, Transform, TransformStamped
 from tfbus.geometry.stamped import (
     GREATEST_BOUND,
     answer_of,
-    as_batch,
     as_max_translation,
-    check_translations,
     is_within,
     not_physical,
     qualified_answer,
@@ -28,13 +24,6 @@ from tfbus.rows import IDENTITY
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 MOVE = Transform((1.0, 2.0, 3.0))
-
-
-def test_a_sample_gives_back_what_it_was_made_of() -> None:
-    sample = TransformStamped("map", "base_link", 7, MOVE, "odometry", True)
-    assert (sample.parent, sample.child, sample.stamp) == ("map", "base_link", 7)
-    assert sample.transform == MOVE
-    assert (sample.authority, sample.static) == ("odometry", True)
 
 
 @pytest.mark.parametrize(
@@ -131,33 +120,6 @@ def test_the_text_of_a_sample_has_frames_and_seconds() -> None:
 
 # Batches
 
-FIRST = TransformStamped("map", "odom", 1, MOVE)
-SECOND = TransformStamped("odom", "base_link", 1, MOVE)
-
-
-def test_any_iterable_of_samples_is_a_batch_in_its_order() -> None:
-    def generated() -> Iterator[TransformStamped]:
-        yield SECOND
-        yield FIRST
-
-    assert as_batch(generated()) == (SECOND, FIRST)
-    assert as_batch([FIRST, SECOND]) == (FIRST, SECOND)
-    assert as_batch([]) == ()
-
-
-@pytest.mark.parametrize(
-    ("samples", "shown"), [(None, "None"), ("map", "'map'"), (b"map", "b'map'"), (7, "7"), (MOVE, "Transform")]
-)
-def test_other_values_than_a_batch_are_a_type_error_that_shows_them(samples: Any, shown: str) -> None:
-    with pytest.raises(TypeError, match=shown):
-        as_batch(samples)
-
-
-@pytest.mark.parametrize("bad", [None, MOVE, ("map", "odom", 1, MOVE)])
-def test_an_element_of_a_batch_that_is_no_sample_is_a_type_error(bad: Any) -> None:
-    with pytest.raises(TypeError, match="expected a TransformStamped"):
-        as_batch([FIRST, bad])
-
 
 @given(samples())
 def test_a_sample_comes_back_from_json(sample: TransformStamped) -> None:
@@ -190,25 +152,6 @@ def test_the_answer_of_a_frame_in_itself_comes_back_from_json(answer: TransformS
 
 
 FAR_AWAY = Transform((1e308, 0.0, 0.0))
-
-
-def test_a_rotation_makes_no_translation_longer() -> None:
-    sample = TransformStamped("a", "b", 0, Transform((3.0, -4.0, 12.0), (1.0, 0.0, 0.0, 0.0)))
-    assert is_within(sample, 13.0)
-    assert str(not_physical(sample, 5.0)) == (
-        "the translation of 'b' in 'a' is 13 m long, which is not physical (at most 5 m)"
-    )
-
-
-def test_the_error_says_how_long_it_is_where_it_is_and_what_is_allowed() -> None:
-    near, far = moving("a", "b", 0, 1e12), moving("b", "c", 0, 2e12, "peer")
-    with pytest.raises(InvalidTransformError) as caught:
-        check_translations((near, far), 1e12)
-    error = caught.value
-    assert (error.reason, error.parent, error.child, error.authority) == ("not physical", "b", "c", "peer")
-    assert str(error) == (
-        "the translation of 'c' in 'b' is 2e+12 m long, which is not physical (at most 1e+12 m), from 'peer'"
-    )
 
 
 @pytest.mark.parametrize(

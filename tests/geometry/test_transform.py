@@ -91,6 +91,8 @@ def test_roll_pitch_and_yaw_are_the_fixed_axes_of_transforms3d(xyz: Vector, rpy:
     t = Transform.from_xyz_rpy(xyz, rpy)
     np.testing.assert_allclose(t.matrix()[:3, :3], euler.euler2mat(*rpy, "sxyz"), rtol=0, atol=1e-14)
     assert t.translation == xyz
+    degrees = [math.degrees(angle) for angle in rpy]
+    assert Transform.from_xyz_rpy(xyz, degrees, degrees=True).is_close(t)
 
 
 # Conversions both ways
@@ -341,6 +343,8 @@ def test_an_array_that_does_not_end_in_3_is_refused_with_its_shape(shape: tuple[
 def test_a_sequence_that_is_not_a_point_is_refused_with_its_shape(point: Any) -> None:
     with pytest.raises(ValueError, match=rf"\({len(point)},\)"):
         Transform.identity().apply(point)
+    with pytest.raises(ValueError, match=r"a point is three numbers, not .*; points go in an array"):
+        Transform.identity().apply([[1.0, 2.0, 3.0]] * 3)  # type: ignore[list-item]
 
 
 # Closeness

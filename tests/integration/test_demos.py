@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import quote
 
@@ -267,6 +268,36 @@ def test_the_demo_of_events_tells_the_story_of_the_tool() -> None:
         (2.25, "frame 'odom' comes from two authorities"),
     ]
     assert lines[-1] == "rejected: {'reserved': 1}, conflicts: 1"
+
+
+@pytest.mark.parametrize(("demo", "page"), [("localisation", "localisation"), ("scans_in_map", "recordings")])
+def test_a_demo_prints_what_its_page_says(demo: str, page: str) -> None:
+    said = "\n".join(output_of(f"{demo}.py", quiet=True))
+    assert f"```text\n{said}\n```" in (DEMOS / "guide" / f"{page}.md").read_text()
+
+
+@pytest.mark.thorough
+def test_the_programs_of_the_tutorial_meet_in_any_order_and_after_a_restart(monkeypatch: pytest.MonkeyPatch) -> None:
+    with TemporaryDirectory() as folder:
+        monkeypatch.setenv("TFBUS_RUNTIME_DIR", folder)
+        with Program(sys.executable, DEMOS / "tf_listener.py") as listener:
+            listener.output.expect("frame 'base_link' is not known")
+            for _ in range(2):
+                with Program(sys.executable, DEMOS / "tf_broadcaster.py") as broadcaster:
+                    listener.output.expect(r"^base_link \(1.1, 0.2, 0.2\)$")
+                    assert broadcaster.end() == 0
+                    assert broadcaster.errors.text == ""
+                listener.output.expect("asked for the latest|newest sample is")
+            assert listener.end() == 0
+        assert listener.errors.text == ""
+
+
+@pytest.mark.thorough
+def test_scans_of_another_process_are_placed_by_the_transforms_of_their_stamps(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("zenoh")
+    with TemporaryDirectory() as folder:
+        monkeypatch.setenv("TFBUS_RUNTIME_DIR", folder)
+        assert output_of("scans_between_processes.py") == ["the wall is at x = 5.000 m in odom"] * 5
 
 
 def test_the_demo_of_simulated_time_patrols_for_an_hour_and_jumps_back() -> None:

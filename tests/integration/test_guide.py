@@ -1,16 +1,23 @@
 """The guide and the README tell the truth: their programs run, their commands parse, and their links lead somewhere.
 
-A block of ``python`` runs by itself and prints something. A block of ``text`` right below it is what it prints.
+A block of ``python`` runs by itself and prints something. A block of ``text`` right below it is what it prints. A block
+of ``py`` is an excerpt from a demo.
 """
 
 import importlib
 import re
 import shlex
 import tomllib
+from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import pytest
+from support.commands import Command
+from support.processes import Program, start_tfbus
+from support.recorded import Line, write_mcap
 
 import tfbus
 from tfbus.cli.application import application
@@ -18,6 +25,7 @@ from tfbus.cli.application import application
 ROOT = Path(__file__).parents[2]
 GUIDE = ROOT / "demos" / "guide"
 README = (ROOT / "README.md").read_text()
+CALIBRATION = (GUIDE / "calibration.md").read_text()
 TF2 = (GUIDE / "tf2.md").read_text()
 PAGES = [ROOT / "README.md", *sorted(GUIDE.glob("*.md"))]
 REFERENCE = sorted((GUIDE / "reference").glob("*.rst"))
@@ -75,7 +83,12 @@ PROGRAMS = [
     for page in PAGES
     for number, block in enumerate(blocks_of(page))
 ]
-COMMANDS = [pytest.param(command, id=f"{page.stem}-{command}") for page in PAGES for command in commands_of(page)]
+TYPED = [(page, command) for page in PAGES for command in commands_of(page)]
+COMMANDS = [pytest.param(command, id=f"{page.stem}-{command}") for page, command in TYPED]
+OUTSIDE = re.compile(r"--(ros|connect|listen|svg) |^pip|dds|^tfbus (router|view|foxglove)")
+"""A command that needs another machine, ROS, a browser, Graphviz, or a port that may be taken."""
+OWN = {command: page.stem for page, command in TYPED if not OUTSIDE.search(command)}
+OF_FILES = re.compile(r"tfbus (info|query|convert|compare|plot|check \S+\.|robot .*--tree)")
 
 
 @pytest.mark.parametrize(("page", "block"), PROGRAMS)
@@ -87,9 +100,37 @@ def test_every_program_prints_what_the_page_says(page: Path, block: Block, capsy
         assert output == block.output
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_excerpt_is_from_a_demo(page: Path) -> None:
+    demos = [without_indent(path.read_text()) for path in (ROOT / "demos").glob("*.py")]
+    for excerpt in re.findall(r"^```py\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
+        assert any(without_indent(excerpt) in demo for demo in demos), excerpt
+
+
+def without_indent(text: str) -> str:
+    return re.sub(r"^ +", "", text, flags=re.MULTILINE)
+
+
+def test_troubleshooting_names_every_error() -> None:
+    page = (GUIDE / "troubleshooting.md").read_text()
+    errors = {name for name in tfbus.__all__ if name.endswith("Error")}
+    groups = {"TransformError", "TransformLookupError", "ExtrapolationError"}
+    assert {name for name in errors - groups if f"`{name}`" not in page} == set()
+
+
 def test_every_page_that_teaches_has_a_program_and_names_a_demo() -> None:
     for page in PAGES:
-        if page.stem in ("index", "README", "protocol", "limits", "security", "changelog", "contributing"):
+        if page.stem in (
+            "index",
+            "README",
+            "protocol",
+            "limits",
+            "security",
+            "changelog",
+            "contributing",
+            "commands",
+            "demos",
+        ):
             continue
         assert blocks_of(page), page.name
         assert re.search(r"^## Run it\n\n(?:.*\n)*.*\]\(\.\./\w+\.py\)", page.read_text(), re.MULTILINE), page.name
@@ -135,6 +176,66 @@ def test_every_command_can_be_typed(command: str) -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     wanted = re.findall(r"\[(.*)\]", command)
     assert set(",".join(wanted).split(",")) - {""} <= extras.keys()
+
+
+def write_recording(path: Path) -> None:
+    """A recording that fits all commands of the guide, under any name: the format is recognised by the content."""
+    start = tfbus.from_seconds(1_396_293_860)  # 2014-03-31T19:24:20
+    identity = tfbus.Transform()
+    statics = [
+        tfbus.TransformStamped("base_link", child, start, identity, static=True)
+        for child in ("laser", "lidar", "camera", "base_laser")
+    ]
+    lines: list[Line] = [(start, "/tf_static", statics)]
+    for stamp in range(start, start + 90 * tfbus.SECOND, tfbus.SECOND // 2):
+        moved = tfbus.Transform((1e-9 * (stamp - start), 0.0, 0.0))
+        pair = [tfbus.TransformStamped("map", "odom", stamp, identity)]
+        pair.append(tfbus.TransformStamped("odom", "base_link", stamp, moved))
+        lines += [(stamp, "/tf", pair), (stamp, "/robot1/tf", pair[1:]), (stamp, "/image", bytes(8))]
+    write_mcap(path, lines)
+
+
+@pytest.mark.parametrize("command", [pytest.param(command, id=command) for command in OWN if OF_FILES.match(command)])
+def test_a_command_of_files_does_what_it_says(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for option, package in (("--parquet", "pyarrow"), ("plot", "matplotlib")):
+        if option in command:
+            pytest.importorskip(package)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demos").symlink_to(ROOT / "demos")
+    words = shlex.split(command)[1:]
+    files = [word for word in words if word.endswith((".mcap", ".bag"))]
+    outputs = {word for before, word in pairwise(words) if before in ("-o", "--parquet", "--static-to-yaml")}
+    outputs |= set(files[1:]) if words[0] == "convert" else set()
+    for file in set(files) - outputs:
+        write_recording(tmp_path / file)
+    done = Command(monkeypatch, capsys)(*words)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout or outputs
+    assert all((tmp_path / output).stat().st_size for output in outputs)
+
+
+@pytest.mark.thorough
+def test_the_commands_of_a_domain_run_beside_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demos").symlink_to(ROOT / "demos")
+    write_recording(tmp_path / "run.mcap")
+    (tmp_path / "calibration.yaml").write_text(re.findall(r"```yaml\n(.*?)```", CALIBRATION, re.DOTALL)[0])
+    commands = [command for command in OWN if not OF_FILES.match(command)]
+    assert len(commands) > 8
+    with ExitStack() as stack:
+        # The path of a socket is short.
+        monkeypatch.setenv("TFBUS_RUNTIME_DIR", stack.enter_context(TemporaryDirectory()))
+        programs: list[tuple[str, Program]] = []
+        for command in commands:
+            command = command.replace("record run.mcap", f"record {len(programs)}.mcap")
+            programs.append((command, stack.enter_context(start_tfbus(*shlex.split(command)[1:]))))
+        for command, program in programs:
+            ends = re.match("tfbus tree", command)
+            said = program.errors if re.search("static|broadcast|record|play|robot|check", command) else program.output
+            assert said.expect(".").strip(), command
+            assert (program.wait() if ends else program.end()) == (0 if ends else 130), (command, program.errors.text)
 
 
 def test_every_public_name_is_on_one_page_of_the_reference() -> None:

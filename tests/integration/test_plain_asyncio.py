@@ -8,12 +8,7 @@ import pytest
 from support.asking import HandClock, settle
 from support.samples import moving
 
-from tfbus import (
-    Buffer,
-    Bus,
-    LookupTimeoutError,
-    TransformStamped,
-)
+from tfbus import Buffer, Bus, LookupTimeoutError, TransformStamped
 
 
 def test_asyncio_timeout_ends_a_wait(buffer: Buffer) -> None:

@@ -10,6 +10,7 @@ from support.samples import moving, static
 from tfbus import Bus, TransformStamped
 from tfbus.links import DomainLink
 from tfbus.links.channels import LONGEST_FILTER, MOST_FILTERS, filter_name
+from tfbus.links.domain import MOST_ROBOTS
 from tfbus.links.message import Heard, Kind, read_message, write_text
 from tfbus.links.relay import ReceivedBatch
 
@@ -171,6 +172,21 @@ def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer(world: World, netwo
     assert quiet.frames == {}
     assert quiet.end.present == (robot.wire.id,)
     assert not quiet.end.rejected
+
+
+def test_of_robots_that_have_gone_so_many_copies_are_kept_and_the_oldest_make_room(
+    world: World, network: Network
+) -> None:
+    stays = world.process(network)
+    for number in range(MOST_ROBOTS + 5):
+        robot = world.process(network, robot=f"r{number}")
+        robot.say(static("map", f"{number}"))
+        world.run(0.5)
+        world.end(robot)
+        world.run(0.1)
+    assert len(stays.frames) == MOST_ROBOTS + 5
+    kept = {sample.child for entry in stays.end.kept() for sample in getattr(entry, "samples", ())}
+    assert kept == {f"{number}" for number in range(5, MOST_ROBOTS + 5)}
 
 
 def test_what_a_link_publishes_goes_to_each_hearer_in_its_own_way(world: World, network: Network) -> None:

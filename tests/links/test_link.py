@@ -16,7 +16,7 @@ from tfbus._aio.turn_budget import TurnBudget
 from tfbus.links import Link
 from tfbus.links.endpoint import ForeignEnd
 from tfbus.links.relay import Turn
-from tfbus.links.seams import Presence, Received, ReceivedMessage, SendReport
+from tfbus.links.seams import Joined, Left, Received, ReceivedMessage, SendReport
 from tfbus.tf_message import MalformedMessageError
 
 pytestmark = pytest.mark.anyio
@@ -246,13 +246,13 @@ async def test_presence_and_refusals_are_announced_under_the_name_of_the_link() 
         async with link_of(bus, carrier, drop_lost=True) as link:
             message = ForeignMessage(False, [ARM])
             broken = ForeignMessage(False, [ARM._replace(child="broken")])
-            for content in (Presence.JOINED, message, broken, Presence.JOINED):
+            for content in (Joined(), message, broken, Joined()):
                 carrier.receive(Received("driver", content))
             await until(lambda: link.statistics().rejected == {"not published": 1})
             await until(lambda: link.statistics().queue.pending == 0)
             assert link.peers == ("driver",)
-            for content in (Presence.LEFT, Presence.LEFT, Presence.JOINED):
-                carrier.receive(Received("driver", content))
+            for again in (Left(), Left(), Joined()):
+                carrier.receive(Received("driver", again))
             await until(lambda: link.statistics().queue.pending == 0)
             assert bus.statistics().frames == 0
         bus.close()
@@ -290,7 +290,7 @@ async def test_a_link_drives_a_clock_that_follows_and_tells_the_time_of_its_own(
     carrier.read = lambda content: ReceivedMessage([], time=content)  # type: ignore[method-assign, arg-type]
     with Bus(clock) as bus:
         async with link_of(bus, carrier, clock=clock, tell_clock=True):
-            carrier.receive(Received("robot", Presence.JOINED))
+            carrier.receive(Received("robot", Joined()))
             carrier.receive(Received("robot", 1_000))
             await until(lambda: clock.now() == 1_000)
             carrier.receive(Received("robot", 1_500))

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tfbus.links.link import MANY, ReceiveQueue
-from tfbus.links.seams import Presence, Received
+from tfbus.links.seams import Joined, Left, Received
 
 MIB = 2**20
 ROOM = 64 * MIB
@@ -27,7 +27,7 @@ def urgent(content: object, size: int = 0, *, follows: bool = False) -> Received
     return Received("peer", content, size, urgent=True, follows=follows)
 
 
-JOINED, LEFT = urgent(Presence.JOINED), urgent(Presence.LEFT)
+JOINED, LEFT = urgent(Joined()), urgent(Left())
 
 
 def drained(queue: ReceiveQueue) -> list[object]:
@@ -43,7 +43,7 @@ def test_urgent_items_overtake_what_waits_of_others(waiting: int) -> None:
     before = list(range(waiting))
     for number in before:
         queue.put(Received("other", number, moving=True))
-    own, hurried = [-1, False], [Presence.JOINED, "question", "answer", Presence.LEFT]
+    own, hurried = [-1, False], [Joined(), "question", "answer", Left()]
     for item in (moving(-1), kept(False), JOINED, urgent("question"), urgent("answer", follows=True), LEFT, moving(-2)):
         queue.put(item)
     assert len(queue) == waiting + 7
@@ -67,26 +67,28 @@ def test_what_is_read_before_the_end_of_a_peer_makes_room_too() -> None:
     for item in (moving(1), moving(2), LEFT, kept("a"), moving(3)):
         queue.put(item)
     assert queue.statistics().dropped == 1
-    assert drained(queue) == [1, 2, Presence.LEFT, "a"], "what is to be read first is dropped last"
+    assert drained(queue) == [1, 2, Left(), "a"], "what is to be read first is dropped last"
     for item in (moving(1, MIB), LEFT, kept("a", ROOM - MIB)):
         queue.put(item)
-    assert drained(queue) == [Presence.LEFT, "a"], "moving items make room first"
+    assert drained(queue) == [Left(), "a"], "moving items make room first"
 
 
 def test_the_end_of_a_peer_comes_after_its_messages_and_before_it_joins_again() -> None:
     queue = ReceiveQueue(1_000)
     for item in (*map(moving, range(3)), LEFT, moving(-1), JOINED):
         queue.put(item)
-    assert drained(queue) == [*range(3), Presence.LEFT, Presence.JOINED, -1]
+    assert drained(queue) == [*range(3), Left(), Joined(), -1]
     # Waiting messages of others do not delay it.
     others = [Received("other", number, moving=True) for number in range(4)]
     for item in (*others[:2], moving("last"), *others[2:], LEFT, JOINED):
         queue.put(item)
-    assert drained(queue) == ["last", Presence.LEFT, Presence.JOINED, *range(4)]
+    assert drained(queue) == ["last", Left(), Joined(), *range(4)]
 
 
 @given(
-    steps=st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from(["live", "state", "answer", *Presence, "get"])))
+    steps=st.lists(
+        st.tuples(st.sampled_from("abc"), st.sampled_from(["live", "state", "answer", Joined(), Left(), "get"]))
+    )
 )
 def test_nothing_is_lost_and_of_each_peer_only_its_coming_overtakes(steps: list[tuple[str, object]]) -> None:
     put: dict[str, list[tuple[int, object]]] = {"a": [], "b": [], "c": []}
@@ -104,14 +106,14 @@ def test_nothing_is_lost_and_of_each_peer_only_its_coming_overtakes(steps: list[
             get()
         else:
             put[sender].append((number, step))
-            first = step == "answer" or isinstance(step, Presence)
+            first = step == "answer" or isinstance(step, (Joined, Left))
             queue.put(Received(sender, step, number, step == "live", first, step == "answer"))
     while get():
         pass
     for sender, items in put.items():
         assert sorted(got[sender], key=lambda item: item[0]) == items
-        in_order = [item for item in items if item[1] is not Presence.JOINED]
-        assert [item for item in got[sender] if item[1] is not Presence.JOINED] == in_order
+        in_order = [item for item in items if item[1] != Joined()]
+        assert [item for item in got[sender] if item[1] != Joined()] == in_order
 
 
 def test_beyond_the_bytes_moving_items_are_dropped_first_and_then_the_oldest_of_the_others() -> None:

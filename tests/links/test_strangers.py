@@ -219,8 +219,8 @@ def test_what_no_message_can_say_is_counted_and_told_once_for_each_peer_and_reas
         for bad in (
             b"",
             b"garbage",
-            b"\3\1",
-            b"\3\1",
+            b"\4\1",
+            b"\4\1",
             write_body(Kind.QUESTION, b"[]"),
             write_body(Kind.QUESTION, b""),
         ):

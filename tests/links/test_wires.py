@@ -132,8 +132,13 @@ async def test_a_message_may_be_as_long_as_any(make: Make) -> None:
     async with running(make()) as one, running(make()) as two:
         await met(one, two)
         message = bytes(range(256)) * (MAX_MESSAGE // 256)
-        two.wire.publish(LIVE, message)
-        await until(lambda: one.messages == [(two.id, message)])
+
+        def arrived() -> bool:
+            # The network may have no room for so much at once.
+            two.wire.publish(LIVE, message)
+            return (two.id, message) in one.messages
+
+        await until(arrived)
 
 
 async def test_a_wire_may_be_closed_twice_and_without_being_opened(make: Make) -> None:

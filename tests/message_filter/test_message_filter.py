@@ -144,13 +144,11 @@ async def test_a_message_needs_the_transforms_of_all_targets(bus: Bus, buffer: B
         tasks.cancel_scope.cancel()
 
 
-async def test_a_tolerance_requires_the_transform_after_the_stamp_too(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
+async def test_a_margin_requires_the_transform_after_the_stamp_too(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     got: list[Pair] = []
     async with (
         anyio.create_task_group() as tasks,
-        MessageFilter(streams.receive, buffer, "map", tolerance=0.2) as pairs,
+        MessageFilter(streams.receive, buffer, "map", margin=0.2) as pairs,
     ):
         tasks.start_soon(read, pairs, got)
         put(streams, Scan(SECOND))
@@ -196,7 +194,7 @@ async def test_stamped_data_are_messages_and_may_be_stamped_latest(bus: Bus, buf
     async def points() -> AsyncIterator[PointStamped]:
         yield point
 
-    async with MessageFilter(points(), buffer, "map", tolerance=5.0) as pairs:
+    async with MessageFilter(points(), buffer, "map", margin=5.0) as pairs:
         message, found = await anext(pairs)
     assert (message, found.stamp) == (point, 7)
 
@@ -543,8 +541,8 @@ async def no_callback(_message: Scan, _reason: DropReason, _error: TransformErro
         ({"target": ["map", "/odom"]}, UnknownFrameError),
         ({"target": []}, ValueError),
         ({"target": 5}, TypeError),
-        ({"tolerance": -1.0}, ValueError),
-        ({"tolerance": "much"}, TypeError),
+        ({"margin": -1.0}, ValueError),
+        ({"margin": "much"}, TypeError),
         ({"timeout": -1.0}, ValueError),
         ({"capacity": 0}, ValueError),
         ({"capacity": 1.5}, TypeError),

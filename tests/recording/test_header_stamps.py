@@ -78,11 +78,6 @@ def test_a_cut_file_has_no_unreadable_message(path: Path) -> None:
     assert (found.stamps.tolist(), found.unreadable) == ([0, 1_500_000_000, 3_000_000_000], 0)
 
 
-def test_without_headers_the_log_times_are_taken(tmp_path: Path) -> None:
-    found = header_stamps(write(tmp_path / "run.mcap", "std_msgs/msg/String", b"string data\n"), "/points")
-    assert (found.stamps.tolist(), found.from_headers) == ([0, 1, 2], False)
-
-
 def test_a_topic_without_messages_is_an_error_that_names_the_others(tmp_path: Path) -> None:
     path = write(tmp_path / "run.mcap", POINT, b"")
     with pytest.raises(RecordingError, match="nothing is on topic '/point'; there are /points") as raised:

@@ -2,7 +2,6 @@
 
 import math
 from collections import Counter
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin
-from support.recorded import SMALL, WRONG_IN_SMALL, Line, answers, as_ros2, write_mcap
+from support.recorded import SMALL, WRONG_IN_SMALL, Line, answers, as_ros2, write_mcap, write_recording
 from support.samples import any_samples, moving, over, static, x_of
 
 from tfbus import (
@@ -27,7 +26,6 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.recording import load, open_recording
-from tfbus.recording.formats.mcap_output import McapOutput
 from tfbus.recording.recording import MAX_DETAILS, Problems, SpeedLimit, fill
 from tfbus.tf_message import MalformedMessageError
 
@@ -92,11 +90,9 @@ def test_samples_are_kept_however_old_they_are(tmp_path: Path) -> None:
 
 
 def test_an_authority_that_joins_another_in_a_long_recording_is_loaded_too(path: Path) -> None:
-    with closing(McapOutput(str(path), overwrite=True)) as output:
-        senders = [1 if k > 1_000 and k % 2 else 0 for k in range(1_200)]
-        output.write([(k, (moving("a", "b", k, float(k), f"sender {one}"),)) for k, one in enumerate(senders)])
-        output.finish()
-    tree = load(path)
+    senders = [1 if k > 1_000 and k % 2 else 0 for k in range(1_200)]
+    entries = [(k, (moving("a", "b", k, float(k), f"sender {one}"),)) for k, one in enumerate(senders)]
+    tree = load(write_recording(path, *entries))
     (edge,) = tree.edges()
     assert edge.samples == 1_200
     assert [x_of(tree, "a", "b", k) for k in (999, 1_100, 1_101)] == [999.0, 1_100.0, 1_101.0]
@@ -209,9 +205,7 @@ def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(
     lines.insert(1_500, (14_990, moving("a", "b", 14_990, -1.0)))
     # A sample beyond the bound of translations, in the second block.
     lines.insert(1_600, (15_990, TransformStamped("a", "b", 15_995, Transform(far))))
-    with closing(McapOutput(str(path), overwrite=True)) as output:
-        output.write([(received, (sample,)) for received, sample in lines])
-        output.finish()
+    write_recording(path, *((received, (sample,)) for received, sample in lines))
     problems: Counter[str] = Counter()
     tree = load(path, problems=problems, max_translation=2_500.0)
     assert problems == {"not physical": 1}

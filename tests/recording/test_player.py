@@ -5,7 +5,7 @@ import math
 import sys
 import threading
 from collections.abc import Awaitable, Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.asking import Asked, settle
 from support.processes import is_open
-from support.recorded import SMALL, WRONG_IN_SMALL, batches_in, write_mcap
+from support.recorded import SMALL, WRONG_IN_SMALL, batches_in, write_mcap, write_recording
 from support.samples import moving, static
 from trio.testing import MockClock
 
@@ -37,7 +37,6 @@ from tfbus import (
 from tfbus.bus.queues import TimedBatch
 from tfbus.geometry.stamped import Batch
 from tfbus.recording import Player, RecordedMessage, Recorder
-from tfbus.recording.formats.mcap_output import McapOutput
 from tfbus.recording.player import ReadAhead
 from tfbus.stamps import STAMP_MAX
 
@@ -50,14 +49,6 @@ PATIENCE = 60.0
 
 AS_FAST_AS_POSSIBLE = math.inf
 START = 1_700_000_000 * SECOND
-
-
-def write_recording(path: Path, *entries: TimedBatch) -> Path:
-    """A recording with batches at log times."""
-    with closing(McapOutput(str(path), overwrite=True)) as output:
-        output.write(entries)
-        output.finish()
-    return path
 
 
 def drive(seconds: Iterable[float], authority: str = "odometry") -> list[TimedBatch]:

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from support.samples import moving, static
 
-from tfbus import MissingRecordingError, RecordingError, Transform, TransformStamped, TransformTree
+import tfbus
+from tfbus import Buffer, Bus, MissingRecordingError, RecordingError, Transform, TransformStamped, TransformTree
 from tfbus.recording import load_static, save_static
 
 HALF = math.sqrt(0.5)
@@ -23,6 +24,35 @@ def test_what_was_saved_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
         assert load_static(tmp_path / name) == samples
     save_static(tmp_path / "empty.json", [])
     assert load_static(tmp_path / "empty.json") == []
+
+
+def test_of_a_buffer_or_a_tree_the_static_frames_are_saved(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.json"
+    with Bus() as bus, Buffer(bus) as buffer:
+        bus.publish([moving("map", "base", 5), static("base", "lidar", 2.0, 7, "tape"), static("base", "camera")])
+        for source in (buffer, buffer.tree):
+            tfbus.save_static(file, source)
+            assert tfbus.load_static(file) == [static("base", "camera"), static("base", "lidar", 2.0, 0, "tape")]
+    tfbus.save_static(file, TransformTree())
+    assert tfbus.load_static(file) == []
+
+
+def test_moving_samples_are_refused_by_name_and_nothing_is_written(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.json"
+    samples = [static("base", "lidar"), moving("map", "base", 5), moving("base", "arm", 5), moving("base", "arm", 6)]
+    tree = TransformTree()
+    tree.insert(moving("map", "base", 5))
+    for source, named in (
+        (samples, "'base', 'arm'"),
+        (tree, "'base'"),
+        ([moving("a", f"{i}", 1) for i in range(12)], "2 more"),
+    ):
+        with pytest.raises(ValueError, match="only static transforms are saved, but these move: ") as caught:
+            save_static(file, source)
+        assert str(caught.value).endswith(named)
+    with pytest.raises(TypeError, match="expected a buffer, a tree or samples, not 5"):
+        save_static(file, 5)  # type: ignore[arg-type]
+    assert not file.exists()
 
 
 def test_plain_data_of_samples_are_entries_and_a_tree_is_filled_by_them(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import struct
 from array import array
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +13,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from support.processes import peak_of
-from support.recorded import SMALL, WRONG_IN_SMALL, Line, messages_in, real, write_blocks, write_mcap
+from support.recorded import SMALL, WRONG_IN_SMALL, Line, messages_in, real, write_blocks, write_mcap, write_recording
 from support.samples import any_samples, moving, static
 
 from tfbus import SECOND, TransformStamped
 from tfbus.recording import FrameSummary, RecordedMessage, RecordingSummary, examine, load, open_recording, summarise
-from tfbus.recording.formats.mcap_output import McapOutput
 from tfbus.recording.summary import Durations, Periods
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tf_message import encode
@@ -201,9 +199,7 @@ def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(path: Pa
     # A late sample of another parent leaves the newest edge as it is, so the next one closes no loop.
     lines.append((40_000 * MS, moving("c", "b", 39_985 * MS, 0.0, "one")))
     lines.append((40_001 * MS, moving("b", "c", 40_001 * MS, 0.0, "three")))
-    with closing(McapOutput(str(path), overwrite=True)) as output:
-        output.write([(received, (sample,)) for received, sample in lines])
-        output.finish()
+    write_recording(path, *((received, (sample,)) for received, sample in lines))
     counted: list[int] = []
     with open_recording(path) as recording:
         summary = summarise(recording, progress=counted.append)

@@ -18,16 +18,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
-from cyclone_peer import (  # type: ignore[import-not-found]
-    COMMON,
-    Header,
-    NodeEntitiesInfo,
-    ParticipantEntitiesInfo,
-    TFMessage,
-    Time,
-    gid,
-    message,
-)
+from cyclone_peer import COMMON, Header, NodeEntitiesInfo, ParticipantEntitiesInfo, TFMessage, Time, gid, message  # type: ignore[import-not-found]
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import float64, sequence

@@ -19,18 +19,7 @@ import anyio
 import pytest
 from anyio.abc import TaskGroup
 from support.asking import Asked
-from support.plain_tree import (
-    Answer,
-    At,
-    Blocked,
-    PlainTree,
-    Sample,
-    check_answer,
-    climb,
-    compare,
-    facts_of,
-    pose,
-)
+from support.plain_tree import Answer, At, Blocked, PlainTree, Sample, check_answer, climb, compare, facts_of, pose
 
 from tfbus import (
     LATEST,

@@ -12,6 +12,7 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
+from support.damage import damaged
 from support.domains import Network, World
 from support.domains import Stranger as WrittenLink
 from support.local_links import RawPeer, files_in, framed
@@ -27,7 +28,7 @@ from tfbus.links.endpoint import MAX_PEERS, MOST_AUTHORITY_TEXT
 from tfbus.links.history import MOST_HELD_SAMPLES, HistoryAsker
 from tfbus.links.local import LocalLink
 from tfbus.links.message import (
-    Entry,
+    VERSION,
     Heard,
     Kind,
     Outgoing,
@@ -38,7 +39,7 @@ from tfbus.links.message import (
     write_question,
     write_text,
 )
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch, RemovedFrame
+from tfbus.links.relay import Entry, OutgoingBatch, ReceivedBatch, RemovedFrame
 from tfbus.links.replica import MANY_ORIGINS, MOST_REMOVALS, Claim, Places, Replica, TooManyEntriesError
 from tfbus.links.seams import Hearing, Joined, Left
 
@@ -91,22 +92,10 @@ def valid(scene: Scene) -> list[bytes]:
 
 
 def mutated(scene: Scene) -> Iterator[bytes]:
-    random = scene.random
+    numbers = [number.to_bytes(8, "little")[:size] for number in EXTREMES for size in (1, 2, 4, 8)]
+    numbers += [struct.pack("<d", number) for number in (float("nan"), float("inf"), 1e308)]
     for _ in range(600):
-        data = bytearray(random.choice(valid(scene)))
-        for _ in range(random.choice([1, 1, 2, 5])):
-            place = random.randrange(len(data) + 1)
-            match random.randrange(4):
-                case 0:
-                    data[place : place + 1] = random.randbytes(1)
-                case 1:
-                    size = random.choice([1, 2, 4, 8])
-                    data[place : place + size] = (random.choice(EXTREMES) % 2 ** (8 * size)).to_bytes(size, "little")
-                case 2:
-                    del data[place : place + random.choice([1, 4, 8, 1_000])]
-                case _:
-                    data[place:place] = struct.pack("<d", random.choice([float("nan"), float("inf"), 1e308]))
-        yield bytes(data)
+        yield damaged(scene.random, scene.random.choice(valid(scene)), numbers)
 
 
 def garbage(scene: Scene) -> Iterator[bytes]:
@@ -120,7 +109,7 @@ def garbage(scene: Scene) -> Iterator[bytes]:
             b"\xff" * 60,
             scene.random.randbytes(99),
         ):
-            yield bytes((3, kind)) + data
+            yield bytes((VERSION, kind)) + data
     yield b""
     yield bytes(2**22 + 1)
 
@@ -132,9 +121,9 @@ def false_counts(_: Scene) -> Iterator[bytes]:
         (0, 0, 65_535, 1),
         (0, 0, 0, 2**32 - 1),
     ]:
-        yield HEAD.pack(3, 1, 0, ways, origins, authorities, entries, 1, BUS, 0, 0, 0) + bytes(2_000)
-    empty = struct.pack("<BHHQ", 0, 0, 60_000, 1) + struct.pack("<HHI", 0, 0, 0) * 60_000
-    yield HEAD.pack(3, 1, 0, 0, 1, 1, 2, 1, BUS, 0, 0, 0) + BUS + struct.pack("<H", 0) + empty * 2
+        yield HEAD.pack(VERSION, 1, 0, ways, origins, authorities, entries, 1, BUS, 0, 0, 0) + bytes(2_000)
+    empty = struct.pack("<BHHQ", 0, 0, 10_000, 1) + bytes(20_000)
+    yield HEAD.pack(VERSION, 1, 0, 0, 1, 1, 2, 1, BUS, 0, 0, 0) + BUS + struct.pack("<H", 0) + empty * 2
 
 
 def ill_questions(_: Scene) -> Iterator[bytes]:
@@ -202,7 +191,7 @@ def false_ways(scene: Scene) -> Iterator[bytes]:
     for number in range(500):
         many = [(scene.random.randbytes(16), (OTHER,) * 8) for _ in range(255)]
         yield live(kind=Kind.SIGN, reach=many if number % 2 else loop)
-    yield HEAD.pack(3, 2, 0, 1, 0, 0, 0, 0, BUS, 0, 0, 0) + OTHER + b"\xff" + OTHER * 255
+    yield HEAD.pack(VERSION, 2, 0, 1, 0, 0, 0, 0, BUS, 0, 0, 0) + OTHER + b"\xff" + OTHER * 255
 
 
 def false_times(_: Scene) -> Iterator[bytes]:

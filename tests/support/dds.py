@@ -42,12 +42,15 @@ class DdsNode:
         The domain.
     user_data : bytes
         ROS 2 gives ``enclave=...``.
+    name : str
+        Of the participant; none if it is empty.
     """
 
-    def __init__(self, number: int, user_data: bytes = b"") -> None:
+    def __init__(self, number: int, user_data: bytes = b"", name: str = "") -> None:
         self._stack = ExitStack()
         self._stack.enter_context(domain(number, CONFIG))
-        self.participant = DomainParticipant(number, Qos(Policy.Userdata(user_data)))
+        named = [Policy.EntityName(name)] if name else []
+        self.participant = DomainParticipant(number, Qos(Policy.Userdata(user_data), *named))
         self._stack.callback(self.participant.__del__)
         self.id: str = self.participant.guid.hex
         self._writers: dict[str, Any] = {}
@@ -63,7 +66,7 @@ class DdsNode:
     def writer(self, topic: str, kind: Any = RawTFMessage) -> Any:
         """The writer of a topic, as it is called in DDS."""
         if topic not in self._writers:
-            latched = topic in ("rt/tf_static", "rt/robot_description", "ros_discovery_info")
+            latched = topic.endswith("/tf_static") or topic in ("rt/robot_description", "ros_discovery_info")
             made = DataWriter(self.participant, Topic(self.participant, topic, kind), LATCHED if latched else MOVING)
             self._writers[topic] = made
             self._stack.callback(self.silence, topic)

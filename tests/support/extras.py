@@ -16,6 +16,7 @@ EXTRAS = {
     "view": ("collada", "trimesh", "viser"),
     "web": ("starlette", "uvicorn", "websockets"),
     "zenoh": ("zenoh",),
+    "trio": ("trio",),
     "test": ("httpx", "uvloop"),
     "thorough": (
         "evo",

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
 from tfbus import TransformStamped
+from tfbus.bus.queues import TimedBatch
 from tfbus.recording import Recording, open_recording
+from tfbus.recording.formats.mcap_output import McapOutput
 from tfbus.recording.recording import RecordedMessage
 from tfbus.tf_message import encode
 
@@ -82,6 +85,14 @@ def write_blocks(path: Path, lines: Iterable[Line]) -> Path:
     """A file whose messages are read in a block each, as each shares its chunk with a large picture."""
     spaced = [each for line in lines for each in (line, (line[0], "/camera", bytes(2**21)))]
     return write_mcap(path, spaced, chunk_size=2**21, compression=CompressionType.ZSTD)
+
+
+def write_recording(path: Path, *entries: TimedBatch) -> Path:
+    """A recording as a `Recorder` makes it, with batches at log times."""
+    with closing(McapOutput(str(path), overwrite=True)) as output:
+        output.write(entries)
+        output.finish()
+    return path
 
 
 def as_ros2(bag: Path, folder: Path, storage: StoragePlugin, **options: Any) -> Path:

@@ -9,7 +9,7 @@ from tfbus.links.endpoint import ForeignEnd
 from tfbus.links.ros import RosOptions
 from tfbus.links.ros.ros_link import RosCarrier, RosMessage
 from tfbus.links.ros.settings import settings_of
-from tfbus.links.seams import Presence, Received, SendReport
+from tfbus.links.seams import Joined, Left, Received, SendReport
 from tfbus.tf_message import encode
 
 Said = tuple[bool, list[tuple[str, str, int]]]
@@ -33,7 +33,7 @@ class ListCarrier(RosCarrier):
 
     def meet(self, is_there: bool) -> None:
         """The peer comes or goes."""
-        self._receive(Received("peer", Presence.JOINED if is_there else Presence.LEFT))
+        self._receive(Received("peer", Joined() if is_there else Left()))
 
     async def _connect(self) -> None:
         """A list is there."""

@@ -67,11 +67,11 @@ def test_each_stamp_has_the_name_that_a_plain_dict_of_all_samples_gives_it(
         newest = max(held, default=None)
         if newest is None or stamp > newest:
             if newest is not None:
-                runs.push(stamp, name, held[newest])
+                runs = runs.push(stamp, name, held[newest])
         else:
             before = max((other for other in held if other < stamp), default=None)
             after = min((other for other in held if other > stamp), default=None)
-            runs.put(stamp, name, before, after, held[newest])
+            runs = runs.put(stamp, name, before, after, held[newest])
         held[stamp] = name
         if keep is not None:
             held = {other: held[other] for other in held if other >= max(held) - keep}

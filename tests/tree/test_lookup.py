@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 from support.samples import moving, over, static, tree_of, x_of
 
-from tfbus import (
-    LATEST,
-    Buffer,
-    FutureExtrapolationError,
-    PastExtrapolationError,
-    TransformTree,
-)
+from tfbus import LATEST, Buffer, FutureExtrapolationError, PastExtrapolationError, TransformTree
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 # Stamps and names

@@ -459,6 +459,15 @@ def test_a_nan_point_stays_nan_and_the_others_are_moved() -> None:
     assert np.isnan(found.points[1]).any()
 
 
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_an_infinite_point_stays_not_finite_without_a_warning(dtype: Any) -> None:
+    tree = along(lambda time: Transform.from_axis_angle((1, 2, 3), time, (time, 0.0, 0.0)))
+    points = np.array([(np.inf, 0, 0), (0, -np.inf, 0), (np.inf, -np.inf, np.nan), (1, 2, 3)], dtype)
+    for target in ("odom", "cart"):
+        found = tree.deskew(scan(points, [0, 5, SECOND, SECOND // 2]), target, "odom")
+        assert np.isfinite(found.points).all(axis=1).tolist() == [False, False, False, True]
+
+
 def test_points_without_an_answer_are_an_error_with_the_first_index_or_nan() -> None:
     tree = along(straight)
     cloud = scan(np.zeros((4, 3), np.float32), [5, SECOND + 1, -1, 5], 0, ring=[1, 2, 3, 4])

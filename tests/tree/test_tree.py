@@ -316,19 +316,6 @@ def test_a_copied_tree_answers_all_questions_as_the_one_that_it_was(
     assert answers(twin, *range(5)) == answers(tree, *range(5))
 
 
-@pytest.mark.parametrize("copied", COPIES)
-def test_samples_of_several_senders_and_parents_are_copied_one_by_one(
-    copied: Callable[[TransformTree], TransformTree],
-) -> None:
-    tree = tree_of(
-        *(moving("map", "a", stamp, 1.0 * stamp, "slam") for stamp in range(3)),
-        *(moving("map", "a", stamp, 2.0 * stamp, "odometry") for stamp in range(3, 6)),
-        *(moving("odom", "a", stamp, 3.0 * stamp, "odometry") for stamp in range(6, 9)),
-        *(moving("map", "odom", stamp, 1.0 * stamp) for stamp in range(9)),
-    )
-    assert answers(copied(tree), *range(10)) == answers(tree, *range(10))
-
-
 def test_a_copy_is_independent_and_keeps_the_windows_and_the_senders() -> None:
     tree = tree_of(*over("map", "base", range(0, 20 * SECOND, SECOND)), static("base", "lidar", authority="urdf"))
     twin = pickle.loads(pickle.dumps(tree))

@@ -9,17 +9,7 @@ from tfbus import LATEST, SECOND, Latest, Transform, TransformStamped, Transform
 from tfbus.events import FrameRemoved
 from tfbus.tree.history import EdgeState
 from tfbus.tree.tree import forest_of
-from tfbus.view.page import (
-    EVENTS_KEPT,
-    SAMPLES,
-    Page,
-    Scene,
-    SceneReader,
-    Texts,
-    Timeline,
-    selection_facts,
-    trail,
-)
+from tfbus.view.page import EVENTS_KEPT, SAMPLES, Page, Scene, SceneReader, Texts, Timeline, selection_facts, trail
 
 
 def driven(end: int = 10) -> TransformTree:

@@ -6,13 +6,7 @@ from typing import Any
 import pytest
 from support.samples import live_tree, moving, static, tree_over
 
-from tfbus import (
-    Edge,
-    Question,
-    TransformLookupError,
-    UnknownFrameError,
-)
-from tfbus.tree.forest import LoopingSample
+from tfbus import Edge, Question, TransformLookupError, UnknownFrameError
 from tfbus.tree.history import FrameHistory
 from tfbus.waiting.live_tree import LiveTree, Waiter
 from tfbus.waiting.watch_index import WatchState
@@ -87,19 +81,6 @@ def test_a_change_of_parents_costs_no_walk_through_all_frames(event: str) -> Non
         live.insert((moving("elsewhere", "f7", 2),))
     assert woken == ["g7"]
     assert frames.reads < 50
-
-
-def test_late_samples_that_form_a_loop_are_told_once_for_each() -> None:
-    told: list[LoopingSample] = []
-    live = LiveTree(live_tree(None).forest, told.append)
-    live.insert((moving("c", "a", 0), moving("c", "a", 9), moving("a", "b", 4), moving("a", "b", 9)))
-    live.insert((moving("c", "a", 10),))
-    assert told == []
-    late = moving("b", "a", 5)
-    live.insert((late,))
-    live.insert((moving("c", "a", 11),))
-    assert told == [(late, (5, ("a", "b", "a")))]
-    assert live.statistics(7).looped == 1
 
 
 def test_an_error_of_one_waiter_does_not_keep_others_from_being_woken() -> None:

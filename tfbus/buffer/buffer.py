@@ -391,15 +391,17 @@ class Buffer:
         """
         at, stamps = deskew_stamps(cloud)
         policy = policy_of(tolerance, max_gap, extrapolate)
-        ends = (int(stamps.max()), int(stamps.min())) if len(stamps) else ()
-        questions = [Question(fixed, cloud.frame, end, policy=policy) for end in ends]
-        questions.append(Question(target, fixed, at, policy=policy))
+        # The oldest one first: it may fail at once.
+        ends = (int(stamps.min()), int(stamps.max())) if len(stamps) else ()
+        questions = [self._on_bus(Question(fixed, cloud.frame, end, policy=policy)) for end in ends]
+        questions.append(self._on_bus(Question(target, fixed, at, policy=policy)))
         patience = math.inf if timeout is None else as_duration(timeout, "timeout")
         with self._clock.move_on_after(patience) as all_of_them:
-            await self._lookup_among(questions)
+            for question in questions:
+                await self._lookups.lookup(question, None)
         for question in questions if all_of_them.cancelled_caught else ():
             try:
-                await self._lookups.lookup(self._on_bus(question), 0.0)
+                await self._lookups.lookup(question, 0.0)
             except LookupTimeoutError as error:
                 error.timeout = patience
                 raise

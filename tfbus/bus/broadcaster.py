@@ -5,7 +5,7 @@ from contextlib import ExitStack, contextmanager, suppress
 
 import numpy.typing as npt
 
-from tfbus.bus.bus import Bus
+from tfbus.bus.bus import Bus, ThreadPublisher
 from tfbus.bus.topology import Invalid, as_invalid
 from tfbus.errors import BusClosedError, UnknownFrameError
 from tfbus.frames import as_prefix
@@ -22,7 +22,9 @@ class TransformBroadcaster:
 
     Parameters
     ----------
-    bus : Bus
+    bus : Bus or ThreadPublisher
+        With the result of `Bus.threadsafe`, any thread may send. The loop of the bus then publishes the samples, leaves
+        out those that the bus refuses, counts and logs them.
     authority : str
         The name of the sender, which errors and tools show.
     prefix : str, optional
@@ -51,11 +53,18 @@ class TransformBroadcaster:
     ...     sample = buffer.lookup_nowait("map", "r17/base_link")
     >>> sample.child, sample.stamp
     ('r17/base_link', 0)
+
+    In a thread, such as that of a driver:
+
+    >>> async def run_driver(bus: Bus) -> None:
+    ...     with bus.threadsafe() as publish:
+    ...         driver = TransformBroadcaster(publish, "driver")
+    ...         await anyio.to_thread.run_sync(driver.send, "odom", "base_link", Transform())
     """
 
     def __init__(
         self,
-        bus: Bus,
+        bus: Bus | ThreadPublisher,
         authority: str = "",
         *,
         prefix: str | None = None,
@@ -64,7 +73,8 @@ class TransformBroadcaster:
     ) -> None:
         if not isinstance(authority, str):
             raise TypeError(f"authority must be a str, not {authority!r}")
-        self.bus = bus
+        self.bus = bus if isinstance(bus, Bus) else bus.bus
+        self._to = bus
         self.authority = authority
         self._prefix = as_prefix(prefix, shared)
         self._invalid = as_invalid(invalid)
@@ -88,7 +98,7 @@ class TransformBroadcaster:
         """
         if self._prefix is not None:
             parent, child = self._on_bus(parent), self._on_bus(child)
-        self.bus.publish(TransformStamped(parent, child, self._stamp(at), transform, self.authority), self._invalid)
+        self._to.publish(TransformStamped(parent, child, self._stamp(at), transform, self.authority), self._invalid)
 
     def send_all(
         self, samples: Iterable[TransformStamped | tuple[str, str, Transform]], at: StampLike | None = None
@@ -109,7 +119,7 @@ class TransformBroadcaster:
         BusClosedError, TypeError
         """
         stamp = self._stamp(at)
-        self.bus.publish([self._sample(sample, stamp) for sample in samples], self._invalid)
+        self._to.publish([self._sample(sample, stamp) for sample in samples], self._invalid)
 
     def send_columns(
         self,
@@ -144,7 +154,7 @@ class TransformBroadcaster:
             for names in (parents, children)
         )
         stamps = self.bus.clock.now() if at is None else at
-        self.bus.publish_columns(above, below, stamps, translations, rotations, self.authority, invalid=self._invalid)
+        self._to.publish_columns(above, below, stamps, translations, rotations, self.authority, invalid=self._invalid)
 
     def send_static(self, parent: str, child: str, transform: Transform) -> None:
         """Publish a transform that holds at every stamp. Later subscribers get it too; sending it again replaces it.
@@ -156,7 +166,7 @@ class TransformBroadcaster:
         """
         parent, child = self._on_bus(parent), self._on_bus(child)
         sample = TransformStamped(parent, child, self.bus.clock.now(), transform, self.authority, static=True)
-        self.bus.publish(sample, self._invalid)
+        self._to.publish(sample, self._invalid)
 
     @contextmanager
     def owning(self, *frames: str) -> Iterator[None]:

@@ -396,7 +396,7 @@ class Bus:
         BusClosedError
         """
         self._check_usable()
-        return self._subscribers.subscribe(callback, tuple(self._topology.latched.values()), removed)
+        return self._subscribers.subscribe(callback, tuple(self._topology.latched.samples.values()), removed)
 
     def stream(self, capacity: int = 1_000, overflow: Overflow = "conflate") -> Stream:
         """The batches as an async iterator: ``with bus.stream() as batches: async for batch in batches``.
@@ -414,7 +414,7 @@ class Bus:
         """
         self._check_usable()
         stream = Stream(capacity, overflow, self._check_thread, self._detach_stream)
-        latched = tuple(self._topology.latched.values())
+        latched = tuple(self._topology.latched.samples.values())
         if latched:
             stream.put(latched)
         self._streams.append(stream)
@@ -490,7 +490,7 @@ class Bus:
 
         ``publish(samples)`` may then be called from any thread. The bus publishes the queued batches with
         ``invalid="drop"``. When more than `capacity` moving samples are queued, the oldest batches are dropped and
-        counted.
+        counted. ``TransformBroadcaster(publish, "driver")`` is a broadcaster for any thread.
 
         Raises
         ------
@@ -518,25 +518,27 @@ class Bus:
             live, before = prefill, prefill.statistics(samples)
         else:
             moment = samples, self._removals + self._resets
-            latched = tuple(self._topology.latched.values())
-            before = BufferStatistics(samples - len(latched), 0, 0, 0, 0)
+            before = BufferStatistics(samples - len(self._topology.latched.samples), 0, 0, 0, 0)
             trees = self._trees.items() if prefill is None else ()
             known = next((live for live, since in trees if since == moment and live.forest.window == window), None)
             live = known or LiveTree(prefill or Forest(window), self._announce_past_loop)
             if known is None:
-                self._fill(live, latched)
+                self._fill(live, prefilled=prefill is not None)
                 self._trees[live] = moment if prefill is None else None
                 self._connect_feeds()
         share = Share(live, before)
         self._buffers[share] = None
         return share
 
-    def _fill(self, live: LiveTree, latched: Batch) -> None:
+    def _fill(self, live: LiveTree, *, prefilled: bool) -> None:
         """Give a new tree the latched samples."""
         late = LateBuffer(live, self._topology)
         live.tell_expired = self._topology.expired
-        if latched:
-            late.insert(latched)
+        latched = self._topology.latched
+        if not prefilled:
+            live.forest.share(latched)
+        elif latched.samples:
+            late.insert(tuple(latched.samples.values()))
         if not late.has_caught_up:
             self._late[live] = late
 
@@ -751,17 +753,22 @@ class ThreadPublisher:
     """The result of `Bus.threadsafe`: inside its ``with``, a function that any thread may call.
 
     Samples are queued here and published on the event loop, with one wake-up of the loop for all that has gathered.
+    `TransformBroadcaster` takes it in place of a bus.
 
     Parameters
     ----------
     bus : Bus
     capacity : int
         How many moving samples may be pending; beyond that the oldest batches are dropped and counted.
+
+    Attributes
+    ----------
+    bus : Bus
     """
 
     def __init__(self, bus: Bus, capacity: int) -> None:
         self.queue = SampleQueue(capacity, "drop_oldest")
-        self._bus = bus
+        self.bus = bus
         self._lock = threading.Lock()
         self._waker = LoopWaker(self._drain)
         self._ended = False
@@ -769,9 +776,9 @@ class ThreadPublisher:
     def __enter__(self) -> "ThreadPublisher":
         self._waker.bind()
         try:
-            self._bus._check_usable()
-            self._bus._entered.add(self)
-            self._bus._threads.append(self)
+            self.bus._check_usable()
+            self.bus._entered.add(self)
+            self.bus._threads.append(self)
         except BaseException:
             self.end()
             raise
@@ -782,8 +789,8 @@ class ThreadPublisher:
     ) -> None:
         self.end()
         self._drain()
-        self._bus._entered.discard(self)
-        self._bus._threads.remove(self)
+        self.bus._entered.discard(self)
+        self.bus._threads.remove(self)
 
     def __call__(self, samples: TransformStamped | Iterable[TransformStamped]) -> None:
         """Hand over one sample or a batch; the order within a thread is kept.
@@ -805,8 +812,8 @@ class ThreadPublisher:
         dropped and counted there.
         """
         batch = as_batch(samples)
-        self._bus._owner.check_process()
-        check_translations(batch, self._bus.max_translation)
+        self.bus._owner.check_process()
+        check_translations(batch, self.bus.max_translation)
         if not self._waker.bound:
             raise RuntimeError("enter the `with` of bus.threadsafe() on the event loop first")
         with self._lock:
@@ -818,6 +825,27 @@ class ThreadPublisher:
         except RuntimeError as error:
             self.end()
             raise BusClosedError("the event loop of the bus has ended") from error
+
+    def publish(self, samples: TransformStamped | Iterable[TransformStamped], invalid: Invalid = "drop") -> None:  # noqa: ARG002
+        """Hand samples over as a call does; for `invalid`, as the bus has it, there is no choice here."""
+        self(samples)
+
+    def publish_columns(
+        self,
+        parents: Names,
+        children: Names,
+        stamps: StampLike | StampsLike,
+        translations: npt.ArrayLike,
+        rotations: npt.ArrayLike,
+        authority: str = "",
+        *,
+        static: bool = False,
+        invalid: Invalid = "drop",  # noqa: ARG002
+    ) -> None:
+        """Hand over the samples in some arrays; see `Bus.publish_columns`. A row that is no sample raises its error."""
+        bound = self.bus.max_translation
+        columns = SampleColumns(parents, children, stamps, translations, rotations, authority, static, bound)
+        self(columns.samples())
 
     def end(self) -> None:
         """Take no more samples."""
@@ -843,5 +871,5 @@ class ThreadPublisher:
                 batch = self.queue.get()
             if batch is None:
                 return
-            if not self._bus.closed:
-                self._bus.publish(batch, invalid="drop")
+            if not self.bus.closed:
+                self.bus.publish(batch, invalid="drop")

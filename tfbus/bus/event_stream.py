@@ -10,6 +10,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
 from heapq import heapify, heappop, heappush
+from itertools import islice
 
 from tfbus._aio.task_groups import OneReaderStream
 from tfbus.bus.queues import check_capacity
@@ -32,7 +33,7 @@ from tfbus.events import (
     StampBehind,
 )
 from tfbus.geometry.stamped import Batch
-from tfbus.stamps import as_duration, from_seconds, to_seconds
+from tfbus.stamps import STAMP_MIN, as_duration, from_seconds, to_seconds
 from tfbus.statistics import QueueStatistics
 from tfbus.tree.cycles import NewestEdge
 
@@ -61,9 +62,11 @@ class EventQueue:
     capacity : int
         How many events may be pending, at least one; the events of `known` and of `put_staleness` do not count, and are
         never dropped.
-    known : iterable of FrameAdded, StampAhead or StampBehind
-        The first events: for each frame that has a parent, and for each of these frames that is ahead of the clock or
-        behind it.
+    known : iterable of tuple
+        The fields of the first events, a `FrameAdded` for each frame that has a parent. Each event is made when it is
+        read.
+    implausible : iterable of StampAhead or StampBehind
+        The next events, for each of these frames that is ahead of the clock or behind it.
 
     Attributes
     ----------
@@ -71,11 +74,17 @@ class EventQueue:
         Number of events lost to the capacity.
     """
 
-    def __init__(self, capacity: int, known: Iterable[FrameAdded | StampAhead | StampBehind] = ()) -> None:
+    def __init__(
+        self,
+        capacity: int,
+        known: Iterable[tuple[int, str, str, str, bool]] = (),
+        implausible: Iterable[StampAhead | StampBehind] = (),
+    ) -> None:
         check_capacity(capacity)
         self.capacity = capacity
         self.dropped = 0
-        self._kept: deque[Event] = deque(known)
+        self._known = deque(known)
+        self._kept: deque[Event] = deque(implausible)
         self._events: deque[Event] = deque()
         self._conflicts: dict[str, SeenKeys] = {}
         self._refusals: dict[str | None, SeenKeys] = {}
@@ -83,7 +92,7 @@ class EventQueue:
             self._is_repetition(event)
 
     def __len__(self) -> int:
-        return len(self._kept) + len(self._events)
+        return len(self._known) + len(self._kept) + len(self._events)
 
     def put(self, event: Event) -> None:
         """Add an event, unless the queue has given an equal conflict or refusal before."""
@@ -106,6 +115,8 @@ class EventQueue:
 
     def get(self) -> Event | None:
         """The next event; None when there is none."""
+        if self._known:
+            return FrameAdded(*self._known.popleft())
         if self._kept:
             return self._kept.popleft()
         return self._events.popleft() if self._events else None
@@ -150,6 +161,8 @@ def _deduplication_key(event: SampleRejected | StampAhead | StampBehind | PastLo
 
 
 _SPARE = 64
+_AT_ONCE = 4_000
+"""The number of frames that `Staleness.changes` looks at in one call, and so in one turn of the event loop."""
 
 
 class Staleness:
@@ -187,10 +200,14 @@ class Staleness:
         self._noted[frame] = None
 
     def changes(self, now: int) -> list[FrameStale | FrameLive]:
-        """The frames that have become stale or live since the last call, as of the stamp `now`."""
+        """The frames that have become stale or live since the last call, as of the stamp `now`.
+
+        It looks at some thousand frames; `due` says whether it must be called again at once.
+        """
         found: list[FrameStale | FrameLive] = []
-        noted, self._noted = self._noted, {}
+        noted = list(islice(self._noted, _AT_ONCE))
         for frame in noted:
+            del self._noted[frame]
             known = self._newest_edge(frame)
             newest = None if known is None else known.newest
             if frame in self._stale:
@@ -201,9 +218,16 @@ class Staleness:
             self._unwatch(frame)
             if newest is not None:
                 self._watch(frame, newest + self._limit)
-        while self._due and self._due[0] < now:
+        room = _AT_ONCE - len(noted)
+        while room > 0 and self._due and self._due[0] < now:
             due = heappop(self._due)
-            for frame in sorted(self._due_at.pop(due, ())):
+            frames = sorted(self._due_at.pop(due, ()))
+            frames, later = frames[:room], frames[room:]
+            room -= len(frames)
+            if later:
+                self._due_at[due] = dict.fromkeys(later)
+                heappush(self._due, due)
+            for frame in frames:
                 known = self._newest_edge(frame)
                 newest = None if known is None else known.newest
                 if newest is not None and newest + self._limit != due:
@@ -217,10 +241,9 @@ class Staleness:
         return found
 
     def due(self) -> int | None:
-        """The first stamp, in ns, at which `changes` may have something new if no sample arrives; None if never.
-
-        Call `changes` first, which works on the noted frames.
-        """
+        """The first stamp, in ns, at which `changes` may have something new if no sample arrives; None if never."""
+        if self._noted:
+            return STAMP_MIN
         while self._due and self._due[0] not in self._due_at:
             heappop(self._due)
         return self._due[0] + 1 if self._due else None
@@ -278,13 +301,11 @@ class EventStream(OneReaderStream[Event]):
         detach: Callable[["EventStream"], object],
     ) -> None:
         super().__init__(check_thread, detach)
-        known = topology.known()
-        self.queue = EventQueue(capacity, [*known, *topology.known_ahead(), *topology.known_behind()])
+        implausible: list[StampAhead | StampBehind] = [*topology.known_ahead(), *topology.known_behind()]
+        self.queue = EventQueue(capacity, topology.known(), implausible)
         self._staleness: Staleness | None = None
         if stale_after is not None and as_duration(stale_after, "stale_after") != math.inf:
             self._staleness = Staleness(from_seconds(stale_after), topology.newest)
-            for event in known:
-                self._staleness.note(event.frame)
         self._clock = clock
 
     @property
@@ -311,7 +332,12 @@ class EventStream(OneReaderStream[Event]):
 
     def _next(self) -> Event | None:
         event = self.queue.get()
-        if event is None and self._staleness is not None and not self._ended:
+        if self._staleness is None:
+            return event
+        if isinstance(event, FrameAdded):
+            # The first events were not put into the stream.
+            self._staleness.note(event.frame)
+        elif event is None and not self._ended:
             self.queue.put_staleness(self._staleness.changes(self._clock.now()))
             event = self.queue.get()
         return event

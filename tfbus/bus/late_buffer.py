@@ -36,8 +36,6 @@ class LateBuffer:
         self._live = live
         self._frames = live.forest.frames
         self._newest_edge = newest_edge = topology.newest
-        # Frames whose newest sample on the bus the buffer has not seen, with its parent and its stamp in ns.
-        self._unseen: dict[str, tuple[str, int]] = {}
         # Frames of the prefill that the bus does not know, or knows only up to an older stamp.
         self._foreign: set[str] = set()
         for child, history in tuple(self._frames.items()):
@@ -49,10 +47,12 @@ class LateBuffer:
                 live.remove_frame(child)
             elif edge.newest is not None and history.newest is not None and history.newest > edge.newest:
                 self._foreign.add(child)
-        for child, edge in topology.moving().items():
-            prefilled = None if child not in self._frames else self._frames[child].newest
-            if edge.newest is not None and (prefilled is None or prefilled < edge.newest):
-                self._unseen[child] = edge.parent, edge.newest
+        # Frames whose newest sample on the bus the buffer has not seen, with its parent and its stamp in ns.
+        self._unseen = topology.moving()
+        for child, history in self._frames.items():
+            unseen = self._unseen.get(child)
+            if unseen is not None and history.newest is not None and history.newest >= unseen[1]:
+                del self._unseen[child]
         for child in tuple(self._foreign):
             self._open_loop(child)
 

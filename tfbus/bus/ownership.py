@@ -74,12 +74,12 @@ class Ownership:
         return frame in self._first
 
     def remember(self, known: Mapping[str, NewestEdge]) -> None:
-        """Keep children for their first authorities across a jump of the clock, if that is the policy.
+        """Keep moving children for their first authorities across a jump of the clock, if that is the policy.
 
         It costs one name for each child that was published and not removed.
         """
         if self._first_keeps:
-            self._first.update((child, edge.authority) for child, edge in known.items())
+            self._first.update((child, edge.authority) for child, edge in known.items() if not edge.static)
 
     def forget(self, frame: str) -> None:
         """Let any authority publish a frame that was removed; a reservation stays."""

@@ -5,10 +5,12 @@ of a bad edge at once.
 """
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from copy import copy
+from itertools import repeat
+from operator import attrgetter
 from typing import Literal, get_args
 
 from tfbus.bus.ownership import Ownership
@@ -39,7 +41,7 @@ from tfbus.stamps import (
     likely_cause,
 )
 from tfbus.tree.cycles import NewestEdge, admit, changed_parents
-from tfbus.tree.forest import KnownFrames
+from tfbus.tree.forest import KnownFrames, StaticFrames
 from tfbus.which_kernel import Edge, Judge
 
 
@@ -233,7 +235,7 @@ class Topology:
     ----------
     names : KnownFrames
         The frames that the newest edges name.
-    latched : dict of str to TransformStamped
+    latched : StaticFrames
         The static sample of each static child.
     rejected : Counter
         Samples that were refused, by reason.
@@ -267,7 +269,7 @@ class Topology:
         # The judge compares stamps with a reading of the clock that is at most a tenth of a second old; a simulated
         # clock is read after each of its moves.
         self.judge = Judge(self._newest, plausibility.max_translation**2)
-        self.latched: dict[str, TransformStamped] = {}
+        self.latched = StaticFrames()
         self.rejected: Counter[str] = Counter()
         self.reparented = 0
         self.kind_changes = 0
@@ -284,20 +286,25 @@ class Topology:
         """The newest edge of a child, if it has one."""
         return self._newest.get(child)
 
-    def moving(self) -> dict[str, NewestEdge]:
-        """The newest edge of each moving child."""
-        return {child: known for child, known in self._newest.items() if not known.static}
+    def moving(self) -> dict[str, tuple[str, int]]:
+        """The newest parent and stamp (ns) of each moving child."""
+        edges = self._newest.items()
+        return {child: (known.parent, newest) for child, known in edges if (newest := known.newest) is not None}
 
-    def known(self) -> list[FrameAdded]:
-        """An event for each child that has a parent, as if it were new."""
-        now = self._announcer.now()
-        return [
-            FrameAdded(now, child, known.parent, known.authority, known.static) for child, known in self._newest.items()
-        ]
+    def known(self) -> deque[tuple[int, str, str, str, bool]]:
+        """The fields of a `FrameAdded` for each child that has a parent, as if it were new.
+
+        Made without a step in Python for each, because a stream that opens asks for all of them in one turn.
+        """
+        edges = self._newest.values()
+        fields = (map(attrgetter(name), edges) for name in ("parent", "authority", "static"))
+        return deque(zip(repeat(self._announcer.now()), self._newest, *fields, strict=False))
 
     def known_ahead(self) -> list[StampAhead]:
         """An event for each child whose newest sample is ahead of the clock."""
         now, newest = self._announcer.now(), self._plausibility.newest_plausible()
+        if newest == STAMP_MAX:
+            return []
         return [
             StampAhead(now, child, known.newest, known.authority)
             for child, known in self._newest.items()
@@ -306,6 +313,8 @@ class Topology:
 
     def known_behind(self) -> list[StampBehind]:
         """An event for each child that was reported as behind the clock, and whose newest sample still is."""
+        if not self.judge.behind:
+            return []
         now, oldest = self._announcer.now(), self._plausibility.oldest_plausible()
         return [
             StampBehind(now, child, known.newest, None, known.authority)
@@ -351,7 +360,7 @@ class Topology:
 
     def remove(self, child: str) -> None:
         """Forget a child and its first authority."""
-        self.latched.pop(child, None)
+        self.latched.remove(child)
         self._ownership.forget(child)
         if self._newest.pop(child, None) is None:
             return
@@ -361,10 +370,11 @@ class Topology:
 
     def clear_moving(self) -> None:
         """Forget every moving child, but keep the right of its first authority."""
-        self._ownership.remember({child: known for child, known in self._newest.items() if not known.static})
-        for child in self.moving():
-            del self._newest[child]
-            self.names.remove(child)
+        self._ownership.remember(self._newest)
+        static = {child: self._newest[child] for child in self.latched.samples}
+        self._newest.clear()
+        self._newest.update(static)
+        self.names = self.latched.names.copy()
 
     def reject(self, reason: str, error: Exception) -> None:
         """Count and announce a sample that was refused."""
@@ -560,9 +570,9 @@ class Topology:
                 known.parent, known.since = parent, self._parents
         known.trusted = None if static or known.authority != authority else authority
         if static:
-            self.latched[child] = sample
+            self.latched.put(sample)
         else:
-            self.latched.pop(child, None)
+            self.latched.remove(child)
 
     def _tell_ahead(self, child: str, newest: int, authority: str) -> None:
         now = self._announcer.now()

@@ -39,8 +39,7 @@ COMMANDS = {
     "plot": "Plot the transforms of some frames from a recording over time: FILE TARGET SOURCE...",
     "query": "Print the transform of SOURCE in TARGET from a recording: the newest, at an instant, or at many.",
     "record": "Record all transforms of a domain to FILE, in MCAP as ROS 2 and Foxglove read it, until Ctrl-C.",
-    "robot": "Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at "
-    "zero.",
+    "robot": "Publish the frames of a robot until Ctrl-C, or print them as a tree.",
     "router": "Connect the programs of all domains with each other, until Ctrl-C.",
     "static": "Publish the static transform of CHILD in PARENT, or all transforms of a file, until Ctrl-C.",
     "tree": "Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.",

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Final, Protocol, TypeVar
 import anyio
 import anyio.lowlevel
 from anyio.abc import TaskStatus
-from cyclopts import Parameter
+from cyclopts import Group, Parameter
 
 from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Backend, UsageError
@@ -73,7 +73,7 @@ class _RobotLookups:
         return await self.link.lookup(target, source, robot=self.robot, timeout=timeout, max_age=max_age)
 
 
-@Parameter(name="*")
+@Parameter(name="*", group=Group("How to join", sort_key=5))
 @dataclass(frozen=True, slots=True)
 class LinkOptions:
     """The options of a command that joins a domain.
@@ -94,6 +94,11 @@ class LinkOptions:
     ros
         Join ROS in place of a domain: dds for ROS 2, dds:42 if its ROS_DOMAIN_ID is 42, zenoh:host:7447 for a router
         of rmw_zenoh, or ws://host:9090 for a rosbridge server of ROS 1 or ROS 2; may be given several times.
+    tf
+        With --ros, the topic of a robot in a namespace, such as /robot1/tf; its static frames are on /robot1/tf_static.
+        May be given several times.
+    tf_prefix
+        With --ros, a prefix for the names of all frames that come from there, such as robot1/.
     backend
         The event loop to run on.
     """
@@ -104,6 +109,8 @@ class LinkOptions:
     robot: str | None = None
     robots: tuple[str, ...] = ()
     ros: tuple[str, ...] = ()
+    tf: tuple[str, ...] = ()
+    tf_prefix: str | None = None
     backend: Backend = "asyncio"
 
     @property
@@ -165,12 +172,14 @@ class LinkOptions:
             If an option is not valid, an address cannot be listened at or reached, or the extra is missing.
         """
         follower = bus.clock if isinstance(bus.clock, ReplayClock) else None
+        if not self.ros and (self.tf or self.tf_prefix is not None):
+            raise UsageError("--tf and --tf-prefix are for ROS: give --ros, such as --ros dds")
         if self.ros:
             async with AsyncExitStack() as stack:
                 links = []
                 for place in self.ros:
                     try:
-                        links.append(await stack.enter_async_context(ros_link(bus, place, clock=follower)))
+                        links.append(await stack.enter_async_context(self.ros_link(bus, place, clock=follower)))
                     except OSError as error:
                         why = os.strerror(error.errno) if error.errno else error
                         raise UsageError(f"cannot join ROS at {place}: {why}") from None
@@ -184,6 +193,15 @@ class LinkOptions:
         }
         async with self._entered(bus, options) as link:
             yield [link]
+
+    def ros_link(self, bus: Bus, place: str, **options: Any) -> Link:
+        """The link to a place of ROS, with the topics and the prefix of the options; raises `UsageError`."""
+        if self.tf:
+            namespace = self.tf[0].rpartition("/")[0]
+            topics = {"joint_topic": "joint_states", "description_topic": "robot_description"}
+            options |= {option: f"{namespace}/{topic}" for option, topic in topics.items()}
+            options |= {"tf": self.tf, "tf_static": [f"{topic}_static" for topic in self.tf]}
+        return ros_link(bus, place, prefix=self.tf_prefix, **options)
 
     def run_remote(self, program: Callable[[RemoteLookups], Awaitable[T]]) -> T:
         """Run a program that asks the buffer of the robot in `robots`, in another process, until its end.

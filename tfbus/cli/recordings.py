@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cyclopts import Parameter
+from cyclopts import Group, Parameter
 
 from tfbus.cli.arguments import Flag, UsageError
 from tfbus.cli.output import format_counts, progress, warn
@@ -13,7 +13,7 @@ from tfbus.recording.recording import Problems, Recording, SpeedLimit, fill, ope
 from tfbus.tree.tree import TransformTree
 
 
-@Parameter(name="*")
+@Parameter(name="*", group=Group("What to read", sort_key=4))
 @dataclass(frozen=True, slots=True)
 class TopicOptions:
     """The options of a command that reads a recording.

@@ -122,11 +122,33 @@ class Transform:
         return cls.from_wxyz(m[:3, 3], mat2quat(r))
 
     @classmethod
-    def from_xyz_rpy(cls, xyz: Numbers, rpy: Numbers) -> "Transform":
-        """From a translation in m and roll, pitch, yaw in rad about the fixed axes x, y, z, as in URDF."""
+    def from_xyz_rpy(cls, xyz: Numbers, rpy: Numbers, *, degrees: bool = False) -> "Transform":
+        """From a translation in m and roll, pitch, yaw about the fixed axes x, y, z, as in URDF.
+
+        Parameters
+        ----------
+        xyz : sequence of 3 floats
+            In m.
+        rpy : sequence of 3 floats
+            In rad.
+        degrees : bool
+            Whether `rpy` is in degrees instead.
+
+        Raises
+        ------
+        InvalidTransformError
+            If a number is not finite, or a length is wrong.
+
+        Examples
+        --------
+        >>> Transform.from_xyz_rpy((0.1, 0.0, 0.2), (0.0, 0.0, 180.0), degrees=True).apply((1.0, 0.0, 0.0))
+        (-0.9, 1.2246467991473532e-16, 0.2)
+        """
         from transforms3d.euler import euler2quat
 
         roll, pitch, yaw = as_floats(rpy, 3, "rpy")
+        if degrees:
+            roll, pitch, yaw = map(math.radians, (roll, pitch, yaw))
         return cls.from_wxyz(xyz, euler2quat(roll, pitch, yaw, "sxyz"))
 
     @classmethod

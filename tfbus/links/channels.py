@@ -13,16 +13,12 @@ from typing import Final
 
 from tfbus.links.endpoint import MAX_PEERS
 from tfbus.links.message import (
-    Entry,
     Kind,
     Outgoing,
     Way,
-    can_hold,
-    reason_not_to_send,
-    size_of,
     write_message,
 )
-from tfbus.links.relay import OutgoingBatch, RemovedFrame, Turn
+from tfbus.links.relay import Entry, OutgoingBatch, RemovedFrame, Turn
 from tfbus.links.replica import Replica, hash_bytes
 from tfbus.links.seams import SendReport, Wire
 
@@ -133,10 +129,9 @@ class Channels:
             return inf
         if now >= self._slow_due:
             self._slow_due = now + self._slow_period
-            batches = [batch for batch in self._newest.values() if can_hold(batch.samples[0])]
-            self._newest.clear()
-            if batches:
-                self._write(self._slow, batches)
+            if self._newest:
+                self._write(self._slow, list(self._newest.values()))
+                self._newest.clear()
         return self._slow_due
 
     def _is_heard(self, channel: _Channel, now: float) -> bool:
@@ -167,7 +162,7 @@ class Channels:
         size = 0
         for entry in entries:
             gathered.append(entry)
-            size += size_of(entry)
+            size += entry.size
             if size >= FULL_MESSAGE:
                 self._write_one(channel, gathered)
                 gathered, size = [], 0
@@ -175,43 +170,21 @@ class Channels:
             self._write_one(channel, gathered)
 
     def _write_one(self, channel: _Channel, entries: list[Entry]) -> None:
-        """One message of all entries if possible, else several; what cannot be sent is left out and reported."""
+        """One message of all entries if possible, else several; a batch that is too large is left out and reported."""
+        size = sum(entry.size for entry in entries)
         number = 0 if channel is self._slow else channel.number + 1
         out = Outgoing(Kind.LIVE, self._bus, number, time=self._time)
         try:
             message = write_message(out, entries)
         except ValueError as error:
-            failure: Exception = error
-        else:
-            channel.number = number
-            for name in channel.names:
-                self._wire.publish(name, message)
-            self._report.sent(sum(map(size_of, entries)))
-            return
-        sendable = [kept for kept in map(self._sendable, entries) if kept is not None]
-        if sendable != entries:
-            if sendable:
-                self._write_one(channel, sendable)
-        elif len(entries) > 1:
             middle = len(entries) // 2
-            self._write_one(channel, entries[:middle])
-            self._write_one(channel, entries[middle:])
-        else:
-            self._report.refused("oversized", failure, size_of(entries[0]))
-
-    def _sendable(self, entry: Entry) -> Entry | None:
-        """The part of an entry that a message can hold: the entry itself if that is all, None if it is nothing."""
-        if isinstance(entry, RemovedFrame):
-            try:
-                write_message(Outgoing(Kind.LIVE, self._bus), [entry])
-            except ValueError as error:
-                self._report.refused("frame name", error)
-                return None
-            return entry
-        errors = list(map(reason_not_to_send, entry.samples))
-        if not any(errors):
-            return entry
-        for refused in filter(None, errors):
-            self._report.refused(refused.reason, refused)
-        kept = tuple(sample for sample, error in zip(entry.samples, errors, strict=True) if error is None)
-        return OutgoingBatch(entry.origin, entry.sequence, kept) if kept else None
+            if middle:
+                self._write_one(channel, entries[:middle])
+                self._write_one(channel, entries[middle:])
+            else:
+                self._report.refused("oversized", error, size)
+            return
+        channel.number = number
+        for name in channel.names:
+            self._wire.publish(name, message)
+        self._report.sent(size)

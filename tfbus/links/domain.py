@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import nullcontext, suppress
 from math import inf
 from time import monotonic
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, TypedDict
 
 from tfbus.bus.bus import Bus
 from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
@@ -19,25 +19,24 @@ from tfbus.links.message import (
     Outgoing,
     Text,
     Way,
-    can_hold,
     kind_of,
     read_fields,
     read_message,
+    sendable,
     write_message,
     write_text,
 )
 from tfbus.links.relay import (
-    OutgoingBatch,
+    Entry,
     Peer,
     Provenance,
-    Rank,
     ReceivedBatch,
     ReceivedTransform,
     RemovedFrame,
     Turn,
 )
-from tfbus.links.replica import CHUNK, Agreement, Claim, Entry, Places, Replica, TooManyEntriesError
-from tfbus.links.seams import Hearing, Joined, Left, Presence, Received, Wire, WireItem
+from tfbus.links.replica import CHUNK, Agreement, Claim, Known, Places, Replica, TooManyEntriesError
+from tfbus.links.seams import Hearing, Joined, Left, Received, Wire, WireItem
 from tfbus.stamps import as_duration
 from tfbus.tf_message import MalformedMessageError
 
@@ -135,17 +134,15 @@ class DomainEnd(Endpoint):
         self._replicas: dict[str, Replica] = {}
         self.own = self._replica_of(self._robot)
         self._agreement = Agreement()
-        self._history = HistoryAsker(history or 0.0, self._ask_past, now)
+        self._history = HistoryAsker(history or 0.0, wire.send, now)
         self.lookups = RemoteLookups(wire.send, name)
-        self._news: dict[str, bool] = {}
         # The last sign of each peer that agrees with this link: the same sign once more need not wake the event loop.
         self._resting: dict[str, bytes] = {}
         # Answering takes half of the event loop's time at most.
         self._questions: dict[tuple[str, Kind], bytes] = {}
         self._answers_due = -inf
         self._waiting: dict[str, Joined] = {}
-        self._signed_at = -inf
-        self._hurries = False
+        self._signed_at = self._sign_due = -inf
         self._sign_period = SIGN_PERIOD
 
     # For the link
@@ -196,14 +193,13 @@ class DomainEnd(Endpoint):
 
     def split(self, item: Received) -> Iterator[Any]:
         if not isinstance(item.content, bytes):
-            return iter((item.content,))
-        return read_message(item.content) if item.moving or item.urgent else self._split_sign(item)
-
-    def _split_sign(self, item: Received) -> Iterator[Any]:
+            yield item.content
+            return
         for part in read_message(item.content):
             yield part
             # Only a sign without a time may rest, because a clock may be followed later.
-            if isinstance(part, Heard) and part.time is None and self._agreement.rests(item.sender, self._now()):
+            is_plain = isinstance(part, Heard) and part.kind is Kind.SIGN and part.time is None
+            if is_plain and self._agreement.rests(item.sender, self._now()):
                 self._resting[item.sender] = item.content
 
     def _warn_of_wire(self, error: Exception) -> None:
@@ -213,8 +209,7 @@ class DomainEnd(Endpoint):
 
     def sign_soon(self) -> None:
         """Sign in the next turn of the event loop, or `SOONEST_SIGN` after the last sign."""
-        self._hurries = True
-        self.host.stir()
+        self._sign_within(SOONEST_SIGN)
 
     def serve(self, server: BufferServer | None) -> None:
         """Serve a buffer, or none any more."""
@@ -225,18 +220,17 @@ class DomainEnd(Endpoint):
 
     keeps_withdrawn = True
 
-    def keep(self, entry: OutgoingBatch | RemovedFrame) -> None:
+    def keep(self, entry: Entry) -> None:
         rank, wanted = (entry.sequence, entry.origin), entry.within(self.frames)
         if isinstance(wanted, RemovedFrame):
             self.own.note(wanted.frame, rank, None, ours=True)
             return
         for sample in () if wanted is None else wanted.samples:
             _, child, _, _, _, static = sample._fields
-            if can_hold(sample):
-                with suppress(TooManyEntriesError):
-                    self.own.note(child, rank, sample, ours=True, settles=not static)
+            with suppress(TooManyEntriesError):
+                self.own.note(child, rank, sample, ours=True, settles=not static)
 
-    def kept(self) -> Iterator[OutgoingBatch | RemovedFrame]:
+    def kept(self) -> Iterator[Entry]:
         for replica in self._replicas.values():
             yield from replica.told()
 
@@ -247,14 +241,13 @@ class DomainEnd(Endpoint):
     def reach_changed(self) -> None:
         self.sign_soon()
 
-    def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
-        if not echo:
-            self.keep(batch)
-        return False
+    def outgoing(self, entry: Entry) -> Entry | None:
+        wanted = super().outgoing(entry)
+        return None if wanted is None else sendable(wanted, self.report.refused)
 
-    def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
-        if rank is not None:
-            self.own.note(frame, rank, None, ours=True)
+    def _follow(self, entry: Entry, goes_out: bool) -> bool:
+        if goes_out:
+            self.keep(entry)
         return False
 
     # Going out
@@ -267,14 +260,14 @@ class DomainEnd(Endpoint):
         period = max(SIGN_PERIOD, SIGN_PERIOD_EACH * len(self.peers))
         if period < self._sign_period:
             self._sign_period = period
-            self.host.stir()
+            self._sign_within(period)
 
-    @property
-    def _sign_due(self) -> float:
-        return self._signed_at + (SOONEST_SIGN if self._hurries else self._sign_period)
+    def _sign_within(self, seconds: float) -> None:
+        self._sign_due = min(self._sign_due, self._signed_at + seconds)
+        self.host.stir()
 
     def _sign(self, now: float) -> None:
-        self._signed_at, self._hurries = now, False
+        self._signed_at, self._sign_due = now, now + self._sign_period
         self.send()
         self._channels.sign(self.own, now, self._reach(), self._serves)
 
@@ -287,7 +280,7 @@ class DomainEnd(Endpoint):
         self.send()
         claim = self.own.claim(self._now())._replace(partial=self.frames is not None)
         out = Outgoing(Kind.MEETING, self.relay.origin, 0, claim, self.time, self._reach(), self._serves)
-        entries: Sequence[OutgoingBatch | RemovedFrame] = self.own.ours(CHUNK) or ()
+        entries: Sequence[Entry] = self.own.ours(CHUNK) or ()
         try:
             message = write_message(out, entries)
         except ValueError:
@@ -304,28 +297,27 @@ class DomainEnd(Endpoint):
                 return
             urgent = kind in _URGENT
             received = Received(link, item, len(item), kind is Kind.LIVE, urgent, kind in _FOLLOWS)
-        elif isinstance(item, Left):
-            received = Received(link, Presence.LEFT, urgent=True)
         else:
-            received = Received(link, item, urgent=isinstance(item, Joined))
+            received = Received(link, item, urgent=isinstance(item, (Joined, Left)))
         self.host.receive(received)
 
+    def _joined(self, sender: str, joined: Joined) -> None:
+        peer = self._join(sender, joined.robot)
+        if peer is not None:
+            peer.rate = next((rate for one, rate in self._rates.items() if one.matches(peer.robot)), inf)
+            self._meet(peer)
+            self._sign_sooner()
+            # A robot of rate 0 only answers lookups.
+            if peer.rate:
+                # A peer hears of a filter by the first question.
+                self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
+                self._history.joined(sender)
+            self.host.stir()
+        elif sender not in self.peers and len(self._waiting) < MOST_WAITING:
+            self._waiting[sender] = joined
+
     def _take(self, sender: str, content: Any) -> None:
-        if isinstance(content, Joined):
-            peer = self._join(sender, content.robot)
-            if peer is not None:
-                peer.rate = next((rate for one, rate in self._rates.items() if one.matches(peer.robot)), inf)
-                self._meet(peer)
-                self._sign_sooner()
-                # A robot of rate 0 only answers lookups.
-                if peer.rate:
-                    # A peer hears of a filter by the first question.
-                    self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
-                    self._history.joined(sender)
-                self.host.stir()
-            elif sender not in self.peers and len(self._waiting) < MOST_WAITING:
-                self._waiting[sender] = content
-        elif isinstance(content, _Due):
+        if isinstance(content, _Due):
             self._answer_due(sender, content)
         elif isinstance(content, Text):
             self._take_text(sender, content)
@@ -374,73 +366,76 @@ class DomainEnd(Endpoint):
         self._take_held(peer, heard)
 
     def _take_held(self, peer: Peer, heard: Heard) -> None:
-        now = self._now()
-        live = heard.kind is Kind.LIVE
-        numbered = not heard.continues and (live or heard.kind is Kind.SIGN)
+        now, kind = self._now(), heard.kind
+        live = kind is Kind.LIVE
+        numbered = not heard.continues and kind in (Kind.LIVE, Kind.SIGN)
         is_gap = numbered and self._count_gap(peer, heard.number, live)
-        if is_gap or not live:
-            self._resting.pop(peer.id, None)
         if is_gap:
             self._agreement.missed(peer.id, now)
+        if is_gap or not live:
+            self._resting.pop(peer.id, None)
             self.host.stir()
-        if heard.kind is Kind.PAST:
-            self._take_past(peer, heard)
+        if kind is Kind.PAST and peer.id not in self._history.open:
             return
-        news = self._take_entries(peer, heard, live)
-        if heard.kind is Kind.ANSWER:
-            news = self._news.pop(peer.id, False) or news
-            if heard.goes_on:
-                self._news[peer.id] = news
-            else:
-                self._agreement.answered(peer.id, heard.claim, news, now)
-        elif not heard.goes_on and not live:
-            is_much = heard.kind is Kind.MEETING and not heard.continues and not heard.entries
+        peer.news = self._take_entries(peer, heard) or (heard.continues and peer.news)
+        if live or heard.goes_on:
+            return
+        if kind is Kind.PAST:
+            if not self._history.goes_on(peer.id, heard):
+                self._end_history(peer.id)
+        elif kind is Kind.ANSWER:
+            self._agreement.answered(peer.id, heard.claim, peer.news, now)
+        else:
+            is_much = kind is Kind.MEETING and not heard.continues and not heard.entries
             self._agreement.told(peer.id, heard.claim, now, soon=is_much)
-        if not live:
-            self.host.stir()
 
-    def _take_entries(self, peer: Peer, heard: Heard, live: bool) -> bool:
-        """Note and publish the entries of a message; returns whether any of them was new to the copy."""
+    def _take_entries(self, peer: Peer, heard: Heard) -> bool:
+        """Note and publish the entries of a message; returns whether any of them was news."""
         for error in heard.errors:
             self.reject(peer.id, error.reason, error)
-        replica = self._replica_of(peer.robot)
+        replica, live = self._replica_of(peer.robot), heard.kind is Kind.LIVE
         news = False
         together: list[tuple[Provenance, list[ReceivedTransform]]] = []
         for entry in heard.entries:
+            if isinstance(entry, RemovedFrame) and entry.within(self.frames) is None:
+                continue
+            assert entry.origin is not None
+            size = len(entry.samples) if isinstance(entry, ReceivedBatch) else 1
+            if not self.relay.is_plausible(entry.sequence):
+                # It would make all later numbers of its origin old.
+                why = f"a batch with the number {entry.sequence}, which is too far ahead of all others"
+                self.reject(peer.id, "number", ValueError(why), size)
+                continue
+            provenance = Provenance(entry.origin, entry.sequence, self, peer)
             if isinstance(entry, ReceivedBatch):
-                assert entry.origin is not None
-                size = len(entry.samples)
-                if not self._admit_number(peer, entry.sequence, size):
-                    continue
                 # The authorities of a bus beyond the peer do not count as the peer's.
                 others = entry.origin not in peer.paths
                 if not others and not self._admit_authorities(peer, entry.authorities, size):
                     continue
-                provenance = Provenance(entry.origin, entry.sequence, self, peer)
-                samples = self._note(replica, provenance, entry.samples, live)
-                news = news or (bool(samples) and not live)
+                samples = self._wanted(entry.samples)
+                if heard.kind is not Kind.PAST:
+                    samples = self._note(replica, provenance, samples, live)
+                news = news or bool(samples)
                 together.append((provenance, samples))
                 # The batches of an answer were never one batch, but nothing is between them.
                 if not live:
                     continue
-            self._publish(peer, together, live)
+            self._publish(peer, together, heard.kind)
             together.clear()
             if self.bus.closed:
                 # A subscriber may have closed it since the last entry.
                 return news
-            if isinstance(entry, RemovedFrame):
-                news = self._take_removal(peer, replica, entry) or news
-        self._publish(peer, together, live)
+            if isinstance(entry, RemovedFrame) and replica.note(entry.frame, provenance.rank, None):
+                self.relay.remove(provenance, entry.frame)
+                news = True
+        self._publish(peer, together, heard.kind)
         return news
 
     def _note(
         self, replica: Replica, provenance: Provenance, samples: list[ReceivedTransform], live: bool
     ) -> list[ReceivedTransform]:
         """Note the samples of a batch in a copy; returns the samples that the relay has to judge."""
-        samples = self._wanted(samples)
         rank, peer = provenance.rank, provenance.peer
-        if live and replica.note_moving(samples, rank):
-            return samples
         kept: list[ReceivedTransform] = []
         for sample in samples:
             _, child, _, _, _, static = sample._fields
@@ -455,7 +450,7 @@ class DomainEnd(Endpoint):
                 kept.append(sample)
         return kept
 
-    def _shows_moving(self, entry: Entry) -> bool:
+    def _shows_moving(self, entry: Known) -> bool:
         """Whether the bus shows the frame of an entry, and it moves."""
         is_shown = not self.drop_lost or self.relay.reaches(entry.origin)
         return is_shown and entry.sample is not None and not entry.sample.static
@@ -464,23 +459,10 @@ class DomainEnd(Endpoint):
         frames = self.frames
         return samples if frames is None else [sample for sample in samples if sample._fields[1] in frames]
 
-    def _take_removal(self, peer: Peer, replica: Replica, removal: RemovedFrame) -> bool:
-        if removal.within(self.frames) is None or not self._admit_number(peer, removal.sequence, 1):
-            return False
-        provenance = Provenance(removal.origin, removal.sequence, self, peer)
-        is_new = replica.note(removal.frame, provenance.rank, None)
-        if is_new:
-            self.relay.remove(provenance, removal.frame)
-        return is_new
-
     def _publish(
-        self,
-        peer: Peer,
-        batches: Sequence[tuple[Provenance, Sequence[ReceivedTransform]]],
-        live: bool,
-        past: bool = False,
+        self, peer: Peer, batches: Sequence[tuple[Provenance, Sequence[ReceivedTransform]]], kind: Kind
     ) -> None:
-        if not live and not past and self._history.open:
+        if self._history.open and kind not in (Kind.LIVE, Kind.PAST):
             # The newest sample of a moving frame would make its past no news.
             batches = [(source, [sample for sample in samples if sample.static]) for source, samples in batches]
         if self.drop_lost:
@@ -491,17 +473,9 @@ class DomainEnd(Endpoint):
         offered = sum(len(samples) for _, samples in batches)
         if not offered:
             return
-        with nullcontext() if live else self.bus._kept_samples():
+        with nullcontext() if kind is Kind.LIVE else self.bus._kept_samples():
             published, refused = self.relay.publish(batches, self.max_frames)
         self._count(peer.id, offered, published, refused)
-
-    def _admit_number(self, peer: Peer, number: int, count: int) -> bool:
-        """Refuse a number that no bus can have reached; it would make all later numbers of its origin old."""
-        if self.relay.is_plausible(number):
-            return True
-        error = ValueError(f"a batch with the number {number}, which is too far ahead of all others")
-        self.reject(peer.id, "number", error, count)
-        return False
 
     def _count_gap(self, peer: Peer, number: int, live: bool) -> bool:
         """Count the live messages that are missing before this number; returns whether there are any."""
@@ -542,7 +516,7 @@ class DomainEnd(Endpoint):
         super()._leave(sender)
         if self._waiting and len(self.peers) < MAX_PEERS:
             link = next(iter(self._waiting))
-            self._take(link, self._waiting.pop(link))
+            self._joined(link, self._waiting.pop(link))
 
     def _lose(self, peer: Peer) -> tuple[str, ...]:
         self._end_history(peer.id, peer)
@@ -557,7 +531,6 @@ class DomainEnd(Endpoint):
         self._end_history(peer.id)
         self._agreement.left(peer.id)
         self.lookups.left(peer.id)
-        self._news.pop(peer.id, None)
         self._resting.pop(peer.id, None)
         self._forget_robots(peer.robot)
         lost = {bus for bus in peer.paths if self.relay.way_closed(bus)}
@@ -597,7 +570,7 @@ class DomainEnd(Endpoint):
             for entry in replica.entries.values()
             if (buses is None or entry.origin in buses) and isinstance(entry.sample, ReceivedTransform)
         ]
-        self._publish(peer, batches, live=False)
+        self._publish(peer, batches, Kind.ANSWER)
 
     # Answers
 
@@ -630,29 +603,9 @@ class DomainEnd(Endpoint):
         seconds, after = fields.get("seconds"), fields.get("after")
         if isinstance(seconds, bool) or not isinstance(seconds, (int, float)) or not isinstance(after, str):
             raise MalformedMessageError("text", "a question for the past without a time and a name")
-        entries, final = chunk_of_past(self.bus, self.relay, self.own, seconds, after)
+        entries, final = chunk_of_past(self.bus, self.own, seconds, after)
         out = Outgoing(Kind.PAST, self.relay.origin, 0, Claim(0, 0, 0, final))
         self._wire.send(sender, write_message(out, entries))
-
-    def _ask_past(self, peer: str, seconds: float, after: str) -> None:
-        self._wire.send(peer, write_text(Kind.PAST_QUESTION, {"seconds": seconds, "after": after}))
-
-    def _take_past(self, peer: Peer, heard: Heard) -> None:
-        if peer.id not in self._history.open:
-            return
-        goes_on = heard.goes_on
-        try:
-            batches: list[tuple[Provenance, list[ReceivedTransform]]] = []
-            for entry in heard.entries:
-                if isinstance(entry, ReceivedBatch) and self._admit_number(peer, entry.sequence, len(entry.samples)):
-                    assert entry.origin is not None
-                    source = Provenance(entry.origin, entry.sequence, self, peer)
-                    batches.append((source, self._wanted(entry.samples)))
-            self._publish(peer, batches, live=False, past=True)
-            goes_on = goes_on or self._history.goes_on(peer.id, heard)
-        finally:
-            if not goes_on:
-                self._end_history(peer.id)
 
     def _end_history(self, peer: str, lost: Peer | None = None) -> None:
         """Stop waiting for the past of a peer, and publish its live messages that were held back."""
@@ -691,11 +644,8 @@ class DomainEnd(Endpoint):
             self._replicas.pop(robot).forget()
 
 
-class _Due(NamedTuple):
+class _Due(Text):
     """A question whose turn has come."""
-
-    kind: Kind
-    data: bytes
 
 
 def check_name(what: str, name: str, pattern: str, letters: str) -> str:

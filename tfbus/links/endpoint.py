@@ -15,8 +15,8 @@ from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import OnceLogger, SeenKeys
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import REMEMBERED_REASONS, Outbox, OutgoingBatch, Peer, Rank, Turn, relay_of
-from tfbus.links.seams import Carrier, Presence, Received, SendReport, Wire
+from tfbus.links.relay import REMEMBERED_REASONS, Entry, Outbox, Peer, RemovedFrame, Turn, relay_of
+from tfbus.links.seams import Carrier, Joined, Left, Received, SendReport, Wire
 from tfbus.tf_message import MalformedMessageError
 
 MAX_PEERS = 1_000
@@ -185,9 +185,9 @@ class Endpoint(Outbox):
     def handle(self, sender: str, content: Any) -> None:
         """Handle a part of an item; nothing in it makes this raise."""
         try:
-            if content is Presence.JOINED:
-                self._join(sender)
-            elif content is Presence.LEFT:
+            if isinstance(content, Joined):
+                self._joined(sender, content)
+            elif isinstance(content, Left):
                 self._leave(sender)
             elif isinstance(content, MalformedMessageError):
                 self.reject(sender, content.reason, content)
@@ -231,7 +231,11 @@ class Endpoint(Outbox):
         """Forget the frames of a lost peer; returns them, sorted."""
         raise NotImplementedError
 
-    def _join(self, sender: str, robot: str = "") -> Peer | None:
+    def _joined(self, sender: str, joined: Joined) -> None:
+        """Note that a peer is there."""
+        self._join(sender, joined.robot)
+
+    def _join(self, sender: str, robot: str) -> Peer | None:
         """Note that a peer is there; returns it if that is new, and there is a place."""
         if sender not in self.peers and len(self.peers) >= MAX_PEERS:
             # A peer that has never announced itself has to make room.
@@ -373,27 +377,19 @@ class ForeignEnd(Endpoint):
             published, refused = self.relay.publish_foreign(self, peer, samples, self.max_frames)
             self._count(sender, len(samples), published, refused)
 
-    def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
+    def _follow(self, entry: Entry, goes_out: bool) -> bool:
+        said: list[tuple[str, TransformStamped | None]]
+        if isinstance(entry, RemovedFrame):
+            said = [(entry.frame, None)]
+        else:
+            said = [(sample.child, sample if sample.static else None) for sample in entry.samples]
         changed = False
-        for sample in batch.samples:
-            _, child, _, _, _, static = sample._fields
-            if static and (not echo or child in self._latched):
-                self._latched.add(child)
-                self._changes[child] = sample
-                changed = True
-            elif not static and child in self._latched:
-                self._latched.remove(child)
-                self._changes[child] = None
+        for frame, latched in said:
+            if frame in self._latched or (goes_out and latched is not None):
+                (self._latched.discard if latched is None else self._latched.add)(frame)
+                self._changes[frame] = latched
                 changed = True
         return changed
-
-    def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
-        del rank
-        if frame not in self._latched:
-            return False
-        self._latched.remove(frame)
-        self._changes[frame] = None
-        return True
 
     def _take_statics(self) -> dict[str, TransformStamped | None]:
         changes, self._changes = self._changes, {}

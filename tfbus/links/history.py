@@ -12,8 +12,8 @@ from math import inf
 
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.message import Heard
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch, Relay
+from tfbus.links.message import Heard, Kind, write_text
+from tfbus.links.relay import OutgoingBatch, ReceivedBatch
 from tfbus.links.replica import Replica
 from tfbus.stamps import from_seconds
 from tfbus.tree.history import FrameHistory
@@ -34,17 +34,13 @@ MOST_REMEMBERED = 10_000
 """The most peers that are remembered as asked."""
 
 
-def chunk_of_past(
-    bus: Bus, relay: Relay, replica: Replica, seconds: float, after: str
-) -> tuple[list[OutgoingBatch], bool]:
+def chunk_of_past(bus: Bus, replica: Replica, seconds: float, after: str) -> tuple[list[OutgoingBatch], bool]:
     """The moving samples of the last seconds that a link tells to a peer, and whether these are all.
 
     Parameters
     ----------
     bus : Bus
         Its buffers hold the samples.
-    relay : Relay
-        The relay of the bus.
     replica : Replica
         The copy of the frames that the link brings.
     seconds : float
@@ -55,13 +51,12 @@ def chunk_of_past(
     told: list[OutgoingBatch] = []
     count = 0
     for place in range(bisect_right(frames, after), len(frames)):
-        number = relay.newest_number(frames[place])
-        samples = [] if number is None else _recent(bus, frames[place], seconds)
-        if number is None or not samples:
+        newest, samples = replica.entries[frames[place]], _recent(bus, frames[place], seconds)
+        if not samples:
             continue
         if told and count + len(samples) > CHUNK:
             return told, False
-        told.append(OutgoingBatch(number[1], number[0], samples))
+        told.append(OutgoingBatch(newest.origin, newest.number, samples))
         count += len(samples)
     return told, True
 
@@ -97,7 +92,7 @@ def _oldest(history: FrameHistory) -> int:
 
 @dataclass(slots=True)
 class _Open:
-    due: float
+    due: float = 0.0
     after: str = ""
     held: list[Heard] = field(default_factory=list)
     size: int = 0
@@ -110,8 +105,8 @@ class HistoryAsker:
     ----------
     seconds : float
         0 to ask nobody.
-    ask : callable
-        Asks a peer for so many seconds of the frames after a name.
+    send : callable
+        Sends a message to a peer.
     now : callable
         Returns a monotonic time in s.
 
@@ -121,9 +116,9 @@ class HistoryAsker:
         The open questions, by the ids of the asked peers.
     """
 
-    def __init__(self, seconds: float, ask: Callable[[str, float, str], object], now: Callable[[], float]) -> None:
+    def __init__(self, seconds: float, send: Callable[[str, bytes], object], now: Callable[[], float]) -> None:
         self._seconds = seconds
-        self._ask = ask
+        self._send = send
         self._now = now
         self._asked: dict[str, None] = {}
         self.open: dict[str, _Open] = {}
@@ -135,8 +130,7 @@ class HistoryAsker:
             self._asked[peer] = None
             if len(self._asked) > MOST_REMEMBERED:
                 del self._asked[next(iter(self._asked))]
-            self.open[peer] = _Open(self._now() + PATIENCE)
-            self._ask(peer, self._seconds, "")
+            self._ask(peer, "")
 
     def holds(self, peer: str, message: Heard) -> bool:
         """Hold a live message back; returns whether that is so."""
@@ -159,10 +153,13 @@ class HistoryAsker:
         last = max(_children(message), default="")
         if last <= waiting.after or len(waiting.held) >= MOST_HELD:
             return False
-        waiting.after = last
-        waiting.due = self._now() + PATIENCE
-        self._ask(peer, self._seconds, last)
+        self._ask(peer, last)
         return True
+
+    def _ask(self, peer: str, after: str) -> None:
+        waiting = self.open.setdefault(peer, _Open())
+        waiting.after, waiting.due = after, self._now() + PATIENCE
+        self._send(peer, write_text(Kind.PAST_QUESTION, {"seconds": self._seconds, "after": after}))
 
     def end(self, peer: str) -> list[Heard]:
         """Stop waiting for the answer of a peer; returns its messages that were held back."""

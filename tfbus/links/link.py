@@ -23,7 +23,7 @@ from tfbus.links.domain import DomainEnd, EndOptions, check_name
 from tfbus.links.endpoint import Endpoint, HearsTime
 from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import RemoteQuestion
-from tfbus.links.seams import Presence, Received, Wire
+from tfbus.links.seams import Left, Received, Wire
 from tfbus.registration import AsyncOnly, Registration, warn_unless_entered
 from tfbus.stamps import LATEST, Latest, as_duration, as_stamp, from_seconds, to_seconds
 from tfbus.statistics import LinkStatistics, QueueStatistics
@@ -45,7 +45,7 @@ class ReceiveQueue:
     """Holds what threads have received until the event loop reads it.
 
     Items are read in order, but the urgent ones first: they bring two ends to agree, and on a busy machine the other
-    items wait for seconds. The messages of a peer are read before its `Presence.LEFT`, and before its answer, which
+    items wait for seconds. The messages of a peer are read before its `Left`, and before its answer, which
     would split batches otherwise. Only while more than `MANY` moving items wait, an answer overtakes them.
 
     Parameters
@@ -73,7 +73,7 @@ class ReceiveQueue:
         """Append an item, from any thread."""
         with self._lock:
             if item.urgent:
-                if item.content is Presence.LEFT or (item.follows and self._moving <= MANY):
+                if isinstance(item.content, Left) or (item.follows and self._moving <= MANY):
                     self._hurry(item.sender)
                 self._urgent.append(item)
             else:

@@ -10,7 +10,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from time import monotonic
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -49,15 +49,13 @@ _NUMBER = 8
 _ARGUMENTS = "target", "source", "at", "max_age", "source_at", "fixed", "tolerance", "max_gap"
 
 
+@dataclass(eq=False, slots=True)
 class _Pending:
     """A question that was sent: `done` is set when it has an answer, or will have none."""
 
-    __slots__ = ("answer", "done", "peer")
-
-    def __init__(self, peer: str) -> None:
-        self.peer = peer
-        self.answer: bytes | None = None
-        self.done = anyio.Event()
+    peer: str
+    answer: bytes | None = None
+    done: anyio.Event = field(default_factory=anyio.Event)
 
 
 class RemoteLookups:

@@ -9,9 +9,9 @@ sender holds. The samples themselves are a TFMessage behind that. Little endian:
     reach        origin 16 bytes, length u8, and so many buses on the way there, 16 bytes each
     origins      16 bytes each
     authorities  length u16, UTF-8
-    entries      kind u8, origin u16, runs u16, sequence u64, and then
-        batch    runs times: authority u16, static u16, samples u32
-        removal  the length of the name in place of runs, UTF-8
+    entries      kind u8, origin u16, samples u16, sequence u64, and then
+        batch    for each sample: twice the place of its authority, and one more for a static one, u16
+        removal  the length of the name in place of samples, UTF-8
     samples      a TFMessage with the samples of all batches, in their order
 
 The kinds are those of `tfbus.links.replica`, and those of the past and of lookups. Questions are JSON behind version
@@ -29,9 +29,8 @@ import enum
 import json
 import math
 import struct
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, groupby, repeat
 from sys import intern
 from typing import Any, NamedTuple
 
@@ -44,13 +43,13 @@ from tfbus.errors import (
     TransformLookupError,
 )
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch, ReceivedTransform, RemovedFrame
+from tfbus.links.relay import Entry, OutgoingBatch, ReceivedBatch, ReceivedTransform, RemovedFrame
 from tfbus.links.replica import Claim
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
-from tfbus.tf_message import MAX_NAME, MIN_SIZE, MalformedMessageError, decode, decode_in_parts, encode, refusal
+from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode, decode_in_parts, encode, refusal
 
-VERSION = 3
+VERSION = 4
 MAX_BYTES = 2**22
 """The largest message with samples that is sent or read."""
 MAX_HEAD = 2**20
@@ -85,14 +84,12 @@ _LOOKUP_ERRORS = TransformLookupError, InvalidTransformError, ClockResetError, B
 
 _HEADER = struct.Struct("<BBBBHHIQ16sQQQ")
 _ENTRY = struct.Struct("<BHHQ")
-_RUN = struct.Struct("<HHI")
 _LENGTH = struct.Struct("<H")
 _TIME = struct.Struct("<q")
 _BATCH, _REMOVAL = 0, 1
 _FINAL, _PARTIAL, _HAS_TIME, _SERVES = 1, 2, 4, 8
 _BUS = 16
 
-Entry = OutgoingBatch | RemovedFrame
 NOTHING = Claim(0, 0, 0)
 Way = tuple[bytes, tuple[bytes, ...]]
 """A bus that is reached, and the buses on the way there."""
@@ -206,6 +203,27 @@ def write_body(kind: Kind, body: bytes) -> bytes:
     return bytes((VERSION, kind)) + body
 
 
+def sendable(entry: Entry, refuse: Callable[[str, Exception], object]) -> Entry | None:
+    """The part of an entry that a message can hold, None for nothing; the rest is refused with its reason and error."""
+    if isinstance(entry, RemovedFrame):
+        try:
+            _head(Outgoing(Kind.LIVE, b""), [entry])
+        except ValueError as error:
+            refuse("frame name", error)
+            return None
+        return entry
+    if all(map(can_hold, entry.samples)):
+        return entry
+    kept: list[TransformStamped] = []
+    for sample in entry.samples:
+        refused = reason_not_to_send(sample)
+        if refused is None:
+            kept.append(sample)
+        else:
+            refuse(refused.reason, refused)
+    return OutgoingBatch(entry.origin, entry.sequence, kept) if kept else None
+
+
 def can_hold(sample: TransformStamped) -> bool:
     """Whether a message can hold a sample."""
     parent, child, stamp, _, authority, _ = sample._fields
@@ -237,11 +255,6 @@ def reason_not_to_send(sample: TransformStamped) -> InvalidTransformError | None
     )
 
 
-def size_of(entry: Entry) -> int:
-    """The number of samples and removals in an entry."""
-    return len(entry.samples) if type(entry) is OutgoingBatch else 1
-
-
 def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
     if len(entries) > MAX_ENTRIES:
         raise ValueError(f"too much for one message: {len(entries)} entries, more than {MAX_ENTRIES}")
@@ -256,13 +269,11 @@ def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
                 raise ValueError(f"too much for one message: a frame name of {len(name)} bytes")
             body += _pack(_ENTRY, _REMOVAL, origin, len(name), entry.sequence) + name
             continue
-        runs = [
-            (tag, sum(1 for _ in samples))
-            for tag, samples in groupby(entry.samples, lambda sample: (sample._fields[4], sample._fields[5]))
+        tags = [
+            2 * authorities.setdefault(authority, len(authorities)) + static
+            for _, _, _, _, authority, static in (sample._fields for sample in entry.samples)
         ]
-        body += _pack(_ENTRY, _BATCH, origin, len(runs), entry.sequence)
-        for (authority, static), count in runs:
-            body += _pack(_RUN, authorities.setdefault(authority, len(authorities)), static, count)
+        body += _pack(_ENTRY, _BATCH, origin, len(tags), entry.sequence) + struct.pack(f"<{len(tags)}H", *tags)
     claim = out.claim
     flags = _FINAL * claim.final | _PARTIAL * claim.partial | _HAS_TIME * (out.time is not None) | _SERVES * out.serves
     counts = len(out.reach), len(origins), len(authorities), len(entries)
@@ -295,15 +306,11 @@ def _pack(layout: struct.Struct, *values: object) -> bytes:
 
 
 class _Batch(NamedTuple):
-    """A batch as the head of a message tells it: its runs are authority, static flag and number of samples."""
+    """A batch as the head of a message tells it; its tags are the authority of each sample and whether it is static."""
 
     origin: bytes
     sequence: int
-    runs: tuple[tuple[str, bool, int], ...]
-
-    @property
-    def size(self) -> int:
-        return sum(count for _, _, count in self.runs)
+    tags: Sequence[tuple[str, bool]]
 
 
 def kind_of(data: bytes) -> Kind | None:
@@ -343,18 +350,9 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
         raise MalformedMessageError("head", detail) from None
     except UnicodeDecodeError:
         raise MalformedMessageError("head", "a name in a message is no UTF-8") from None
-    count = sum(entry.size for entry in told if isinstance(entry, _Batch))
-    # A number that the data cannot hold is malformed, and is told as such.
-    if MAX_SAMPLES < count <= len(data) // MIN_SIZE:
-        raise MalformedMessageError("oversized", f"a message of {count} samples, more than {MAX_SAMPLES}")
-    tags = chain.from_iterable(
-        repeat((authority, static), size)
-        for entry in told
-        if isinstance(entry, _Batch)
-        for authority, static, size in entry.runs
-    )
+    tags = [tag for entry in told if isinstance(entry, _Batch) for tag in entry.tags]
     samples: list[ReceivedTransform | None] = []
-    if count or end < len(data):
+    if tags or end < len(data):
         payload = data[end:]
         if len(data) > _LARGE:
             yield None
@@ -374,10 +372,10 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
             size += 1
             heard.entries.append(entry)
             continue
-        valid = [sample for sample in samples[place : place + entry.size] if sample is not None]
-        place += entry.size
-        size += 1 + entry.size
-        authorities = [authority for authority, _, _ in entry.runs]
+        valid = [sample for sample in samples[place : place + len(entry.tags)] if sample is not None]
+        place += len(entry.tags)
+        size += 1 + len(entry.tags)
+        authorities = {authority for authority, _ in entry.tags}
         heard.entries.append(ReceivedBatch(valid, authorities, entry.origin, entry.sequence))
     yield heard
 
@@ -391,12 +389,9 @@ def read_fields(data: bytes) -> dict[str, Any]:
         If there is none.
     """
     try:
-        fields = json.loads(data)
-    except (ValueError, RecursionError):
-        fields = None
-    if not isinstance(fields, dict):
-        raise MalformedMessageError("text", f"no JSON object: {data[:40]!r}")
-    return fields
+        return _read(data, MAX_TEXT)
+    except ValueError as error:
+        raise MalformedMessageError("text", str(error)) from None
 
 
 def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, list[_Batch | RemovedFrame], int]]:
@@ -429,7 +424,7 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
         at += length
     entries: list[_Batch | RemovedFrame] = []
     # Each entry takes some bytes, so a false count ends the loop with an error before the list grows long.
-    run_count = 0
+    count = 0
     for index in range(entry_count):
         if index % _PART_OF_HEAD == _PART_OF_HEAD - 1:
             yield None
@@ -438,11 +433,13 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
         if entry_kind == _REMOVAL and size <= MAX_NAME:
             entries.append(RemovedFrame(origins[origin], entry_number, data[at : at + size].decode()))
             at += size
-        elif entry_kind == _BATCH and run_count + size <= MAX_SAMPLES:
-            run_count += size
-            runs = _RUN.iter_unpack(data[at : at + _RUN.size * size])
-            at += _RUN.size * size
-            named = tuple((authorities[authority], bool(static), count) for authority, static, count in runs)
+        elif entry_kind == _BATCH:
+            count += size
+            if count > MAX_SAMPLES:
+                raise MalformedMessageError("oversized", f"a message of more than {MAX_SAMPLES} samples")
+            tags = struct.unpack_from(f"<{size}H", data, at)
+            at += 2 * size
+            named = [(authorities[tag >> 1], bool(tag & 1)) for tag in tags]
             entries.append(_Batch(origins[origin], entry_number, named))
         else:
             raise IndexError
@@ -491,7 +488,7 @@ def read_question(data: bytes) -> RemoteQuestion:
     ValueError
         If they are no question, or it has an integer of more than 64 bits or a name of more than `MAX_NAME` bytes.
     """
-    fields = _read(data)
+    fields = _read(data, MAX_LOOKUP)
     for name, value in fields.items():
         if isinstance(value, str) and len(value.encode()) > MAX_NAME:
             raise ValueError(f"its field {_shown(name)} has more than {MAX_NAME} bytes")
@@ -517,7 +514,7 @@ def read_answer(
     With a question, an answer about other frames or another stamp is none.
     """
     try:
-        answer = _answer_of(_read(data))
+        answer = _answer_of(_read(data, MAX_LOOKUP))
         if question is not None and isinstance(answer, TransformStamped):
             _check_answers(answer, question)
     except Exception as error:  # noqa: BLE001 - the asker gets one kind of error for all bad answers
@@ -551,10 +548,10 @@ def as_timeout(timeout: float | None, longest: float) -> float:
     return longest if timeout is None or math.isnan(timeout) else min(timeout, longest)
 
 
-def _read(data: bytes) -> dict[str, Any]:
+def _read(data: bytes, longest: int) -> dict[str, Any]:
     """The JSON object in some bytes; raises `ValueError` if they are none, or beyond a bound."""
-    if len(data) > MAX_LOOKUP:
-        raise ValueError(f"{len(data)} bytes, more than {MAX_LOOKUP}")
+    if len(data) > longest:
+        raise ValueError(f"{len(data)} bytes, more than {longest}")
     try:
         fields = json.loads(data, parse_int=_integer)
     except RecursionError:

@@ -29,7 +29,7 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from math import inf
 from time import time_ns
-from typing import Any
+from typing import Any, ClassVar
 
 from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import SeenKeys
@@ -71,6 +71,11 @@ class OutgoingBatch:
     sequence: int
     samples: Sequence[TransformStamped]
 
+    @property
+    def size(self) -> int:
+        """The number of its samples."""
+        return len(self.samples)
+
     def within(self, frames: Collection[str] | None) -> "OutgoingBatch | None":
         """The part of it that is about some frames; None if it has none."""
         if frames is None:
@@ -86,10 +91,14 @@ class RemovedFrame:
     origin: bytes
     sequence: int
     frame: str
+    size: ClassVar[int] = 1
 
     def within(self, frames: Collection[str] | None) -> "RemovedFrame | None":
         """The removal itself if it is of one of some frames; None if not."""
         return self if frames is None or self.frame in frames else None
+
+
+Entry = OutgoingBatch | RemovedFrame
 
 
 @dataclass(slots=True)
@@ -107,7 +116,7 @@ class Turn:
         The time of the clock that the link tells, in ns, if it has to be told. A turn may have nothing else.
     """
 
-    entries: list[OutgoingBatch | RemovedFrame]
+    entries: list[Entry]
     statics: dict[str, TransformStamped | None]
     time: int | None = None
 
@@ -133,37 +142,37 @@ class Outbox:
     def __init__(self, frames: Iterable[str] | None) -> None:
         self.frames = None if frames is None else frozenset(frames)
         self.pending = 0
-        self._entries: list[OutgoingBatch | RemovedFrame] = []
+        self._entries: list[Entry] = []
 
-    def add_batch(self, published: OutgoingBatch, echo: bool = False) -> None:
-        """Add samples that were published; an echo, samples that came in by this very link, does not go out."""
-        batch = published.within(self.frames)
-        if batch is None:
-            return
-        if not echo:
-            self._entries.append(batch)
-            self.pending += len(batch.samples)
-        if self._follow(batch, echo) or not echo:
-            self._notify()
+    def add(self, published: Entry, echo: bool = False, withdrawn: bool = False) -> None:
+        """Add what was published or removed on the bus.
 
-    def add_removal(self, removal: RemovedFrame, echo: bool = False, withdrawn: bool = False) -> None:
-        """Add the removal of a frame; it goes out as batches do.
-
-        A frame is withdrawn rather than removed if it left this bus only because its owner was lost.
+        Parameters
+        ----------
+        published : OutgoingBatch or RemovedFrame
+        echo : bool
+            Whether it came in by this very link, and does not go out.
+        withdrawn : bool
+            Whether a frame left this bus only because its owner was lost.
         """
-        if removal.within(self.frames) is None:
-            return
         goes_out = not echo and not (withdrawn and self.keeps_withdrawn)
+        entry = self.outgoing(published) if goes_out else published.within(self.frames)
+        if entry is None:
+            return
         if goes_out:
-            self._entries.append(removal)
-            self.pending += 1
-        if self._follow_removal(removal.frame, (removal.sequence, removal.origin) if goes_out else None) or goes_out:
+            self._entries.append(entry)
+            self.pending += entry.size
+        if self._follow(entry, goes_out) or goes_out:
             self._notify()
 
-    def keep(self, entry: OutgoingBatch | RemovedFrame) -> None:
+    def outgoing(self, entry: Entry) -> Entry | None:
+        """The part of an entry that this link may send; None if it may send nothing of it."""
+        return entry.within(self.frames)
+
+    def keep(self, entry: Entry) -> None:
         """Note an entry that another link knows and this bus does not show, for peers that show it."""
 
-    def kept(self) -> Iterable[OutgoingBatch | RemovedFrame]:
+    def kept(self) -> Iterable[Entry]:
         """The entries that this link knows, for another link that begins later."""
         return ()
 
@@ -178,14 +187,10 @@ class Outbox:
         """Note that the outbox has something to send."""
         raise NotImplementedError
 
-    def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
-        """Note the frames of a batch for late joiners; returns whether anything changes for these."""
-        raise NotImplementedError
+    def _follow(self, entry: Entry, goes_out: bool) -> bool:
+        """Note for late joiners what was published or removed; returns whether anything changes for these.
 
-    def _follow_removal(self, frame: str, rank: Rank | None) -> bool:
-        """Note for late joiners that a frame has gone; returns whether anything changes for these.
-
-        The rank is None if the other ends know of the removal: it came from them, or they see that the owner was lost.
+        It does not go out if the other ends know it: it came from them, or they see that an owner was lost.
         """
         raise NotImplementedError
 
@@ -207,6 +212,8 @@ class Peer:
         The time of the newest samples that it has sent by such a rate, in s.
     number : int
         The number of its newest live message; 0 before the first.
+    news : bool
+        Whether a message of it that is being handled has brought news.
     authorities : set of str
         The authorities whose samples it has sent.
     authority_text : int
@@ -225,6 +232,7 @@ class Peer:
     rate: float = inf
     thinned: float = -inf
     number: int = 0
+    news: bool = False
     authorities: set[str] = field(default_factory=set)
     authority_text: int = 0
     frames: set[str] = field(default_factory=set)
@@ -363,11 +371,6 @@ class Relay:
         """Take samples with the stamps of earlier ones for news."""
         if self._passed is not None:
             self._passed.forget_moving()
-
-    def newest_number(self, frame: str) -> Rank | None:
-        """Number and origin of the newest batch with a frame; None if the frame is not there."""
-        latest = self._latest.get(frame)
-        return None if latest is None else latest.rank
 
     def is_plausible(self, number: int) -> bool:
         """Whether a number may be one that a bus has given by now.
@@ -596,7 +599,7 @@ class Relay:
                     self._settled[child] = provenance.rank
             outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
             for outbox in outboxes:
-                outbox.add_batch(outgoing, echo=outbox is provenance.outbox)
+                outbox.add(outgoing, echo=outbox is provenance.outbox)
 
     def _on_removal(self, frame: str) -> None:
         if self._removing is not None and self._removing[0] == frame:
@@ -604,20 +607,8 @@ class Relay:
         else:
             provenance = Provenance(self.origin, self._next_number()) if self._outboxes else None
         latest = self._latest.pop(frame, None)
-        self._forget_frame(frame, provenance)
-        if provenance is not None:
-            removal = RemovedFrame(provenance.origin, provenance.sequence, frame)
-            for outbox in self._outboxes:
-                if latest is not None or outbox.keeps_withdrawn:
-                    outbox.add_removal(removal, echo=outbox is provenance.outbox)
-        elif latest is not None:
-            withdrawal = RemovedFrame(latest.origin, latest.sequence, frame)
-            for outbox in self._outboxes:
-                outbox.add_removal(withdrawal, echo=outbox is latest.outbox, withdrawn=True)
-
-    def _forget_frame(self, frame: str, provenance: Provenance | None) -> None:
-        """Forget what holds for a frame that has gone, by a removal or, without one, because its owner was lost."""
         self._settled.pop(frame, None)
+        self._newest.pop(frame, None)
         if self._passed is not None:
             # A withdrawn sample may come again unchanged.
             (self._passed.forget if provenance is None else self._passed.retire)(frame)
@@ -626,7 +617,14 @@ class Relay:
             self._removed[frame] = provenance.rank
             if len(self._removed) > _REMEMBERED:
                 del self._removed[next(iter(self._removed))]
-        self._newest.pop(frame, None)
+            removal = RemovedFrame(provenance.origin, provenance.sequence, frame)
+            for outbox in self._outboxes:
+                if latest is not None or outbox.keeps_withdrawn:
+                    outbox.add(removal, echo=outbox is provenance.outbox)
+        elif latest is not None:
+            withdrawal = RemovedFrame(latest.origin, latest.sequence, frame)
+            for outbox in self._outboxes:
+                outbox.add(withdrawal, echo=outbox is latest.outbox, withdrawn=True)
 
     def _is_outranked(self, sample: ReceivedTransform, rank: Rank) -> bool:
         """Whether a higher rank holds: of a removal or a static sample; for a static or own sample, of any."""

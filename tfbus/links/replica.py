@@ -61,7 +61,7 @@ BGP, RFC 4271).
 import heapq
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from math import inf
@@ -75,7 +75,7 @@ except ImportError:  # A Python that has it elsewhere.
     from hashlib import blake2b
 
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import OutgoingBatch, Rank, RemovedFrame
+from tfbus.links.relay import Entry, OutgoingBatch, Rank, RemovedFrame
 
 SETTLING = 1.5
 """s; a frame that moves less often than that is in the digests between its samples."""
@@ -99,23 +99,39 @@ _SPARE = 1_000
 _NEVER = -inf
 
 
-class Entry(NamedTuple):
+@dataclass(eq=False, slots=True)
+class Known:
     """The newest statement on one frame: a sample or a removal.
 
     Attributes
     ----------
+    frame : str
     number, origin
         The rank.
     sample : TransformStamped or None
         None if the frame was removed.
     ours : bool
         Whether this link brings it to the domain: it came from the bus, and not by this link.
+    sequence : int
+        The number of the change; 0 while it has none.
+    digest : int
+        Its part of the digest; 0 until it has settled.
     """
 
+    frame: str
     number: int
     origin: bytes
     sample: TransformStamped | None
     ours: bool
+    sequence: int = 0
+    digest: int = 0
+
+    @property
+    def told(self) -> Entry:
+        """As it goes into a message."""
+        if self.sample is None:
+            return RemovedFrame(self.origin, self.number, self.frame)
+        return OutgoingBatch(self.origin, self.number, (self.sample,))
 
 
 class Claim(NamedTuple):
@@ -178,22 +194,21 @@ class Replica:
 
     Attributes
     ----------
-    entries : dict of str to Entry
+    entries : dict of str to Known
     """
 
     def __init__(self, max_frames: int, own: bytes, places: Places | None = None) -> None:
         self._places = Places(max_frames) if places is None else places
         self._own = own
-        self.entries: dict[str, Entry] = {}
+        self.entries: dict[str, Known] = {}
         # A heap of the removals, the lowest ranks first; a removal stays in it for a while after a newer entry.
         self._removals: list[tuple[Rank, str]] = []
         self._removed = 0
         # Frames whose entries have changed since the last claim and are to settle first.
         self._fresh: dict[str, None] = {}
         self._unsettled: dict[str, float] = {}
-        self._sequences: dict[str, int] = {}
-        self._log: list[tuple[int, str]] = []
-        self._digests: dict[str, int] = {}
+        # The changes in their order; a frame that has changed again since has a higher sequence.
+        self._log: list[tuple[int, Known]] = []
         self._digest = 0
         self._sequence = 0
 
@@ -221,50 +236,25 @@ class Replica:
         known = self.entries.get(frame)
         if known is not None and number <= known.number and not self._replaces(rank, sample, known):
             return False
-        if settles and known is not None and known.sample is not None and known.origin == origin:
-            # A frame that goes on moving.
-            self.entries[frame] = Entry(number, origin, sample, ours)
-            self._fresh[frame] = None
-            return True
         was_removed = known is not None and known.sample is None
         if known is None or known.origin != origin or was_removed is not (sample is None):
             self._count(origin, known, sample)
-        self._forgive(was_removed)
-        self.entries[frame] = Entry(number, origin, sample, ours)
+            self._forgive(was_removed - (sample is None))
+        if known is None:
+            known = self.entries[frame] = Known(frame, number, origin, sample, ours)
+        else:
+            known.number, known.origin, known.sample, known.ours = number, origin, sample, ours
         if settles:
             self._fresh[frame] = None
         else:
             # Numbered at once, because a hundred thousand entries at the next claim would take a turn of seconds.
             self._fresh.pop(frame, None)
             self._unsettled.pop(frame, None)
-            self._number(frame, settled=True)
+            self._number(known, settled=True)
         if sample is None:
-            self._forgive(-1)
             heapq.heappush(self._removals, (rank, frame))
             if self._too_many_removals or len(self._removals) > 2 * MOST_REMOVALS:
                 self._forget_removals()
-        return True
-
-    def note_moving(self, samples: Sequence[TransformStamped], rank: Rank) -> bool:
-        """Take in live samples of frames that go on moving; returns False at the first other sample.
-
-        It does what `note` does for each, in a third of the time: nearly all samples are of this kind.
-        """
-        number, origin = rank
-        entries, fresh, make = self.entries, self._fresh, tuple.__new__
-        for sample in samples:
-            child = sample.child
-            known = entries.get(child)
-            if (
-                known is None
-                or sample.static
-                or known.origin != origin
-                or known.number >= number
-                or known.sample is None
-            ):
-                return False
-            entries[child] = make(Entry, (number, origin, sample, False))
-            fresh[child] = None
         return True
 
     def claim(self, now: float, frames: Collection[str] | None = None) -> Claim:
@@ -273,13 +263,13 @@ class Replica:
         digest = self._digest
         if frames is not None:
             digest = 0
-            for frame in frames:
-                digest ^= self._digests.get(frame, 0)
+            for known in filter(None, map(self.entries.get, frames)):
+                digest ^= known.digest
         return Claim(self._sequence, self._sequence, digest)
 
     def changes(
         self, since: int, now: float, frames: Collection[str] | None = None, limit: int = CHUNK
-    ) -> tuple[list[OutgoingBatch | RemovedFrame], Claim]:
+    ) -> tuple[list[Entry], Claim]:
         """The oldest changes behind a sequence, and the claim that goes with them.
 
         A sequence that the copy has not reached gives the beginning of all that it holds: a claim since 0. Entries that
@@ -288,53 +278,45 @@ class Replica:
         self._settle(now)
         for frame in self._unsettled:
             # Numbered now for the order of this answer, and again when it settles, for the links without this answer.
-            if frame not in self._sequences:
-                self._number(frame)
+            if not self.entries[frame].sequence:
+                self._number(self.entries[frame])
         if since > self._sequence:
             since = 0
-        found: list[OutgoingBatch | RemovedFrame] = []
-        log: Iterator[tuple[int, str]]
+        log: Iterable[tuple[int, Known]]
         if frames is None:
             log = islice(self._log, bisect_right(self._log, since, key=_first), None)
         else:
-            log = iter(sorted((self._sequences[frame], frame) for frame in frames if frame in self._sequences))
-        for sequence, frame in log:
-            if sequence > since and self._sequences.get(frame) == sequence:
-                found.append(_told(frame, self.entries[frame]))
+            log = sorted(((known.sequence, known) for known in map(self.entries.get, frames) if known), key=_first)
+        found: list[Entry] = []
+        for sequence, known in log:
+            if sequence > since and known.sequence == sequence:
+                found.append(known.told)
                 if len(found) == limit and sequence < self._sequence:
                     return found, Claim(since, sequence, 0, final=False)
         return found, self.claim(now, frames)._replace(since=since)
 
-    def ours(self, limit: int) -> list[OutgoingBatch | RemovedFrame] | None:
+    def ours(self, limit: int) -> list[Entry] | None:
         """All that this link brings to the domain; None if that is more than a limit."""
-        found: list[OutgoingBatch | RemovedFrame] = []
-        for frame, entry in self.entries.items():
-            if entry.ours and entry.sample is not None:
-                if len(found) == limit:
-                    return None
-                found.append(_told(frame, entry))
-        return found
+        ours = (known.told for known in self.entries.values() if known.ours and known.sample is not None)
+        found = list(islice(ours, limit + 1))
+        return None if len(found) > limit else found
 
-    def told(self) -> Iterator[OutgoingBatch | RemovedFrame]:
+    def told(self) -> Iterator[Entry]:
         """All entries."""
-        for frame, entry in self.entries.items():
-            yield _told(frame, entry)
+        return (known.told for known in self.entries.values())
 
     def moving(self) -> list[str]:
         """The moving frames that this link brings to the domain, sorted."""
-        return sorted(
-            frame
-            for frame, entry in self.entries.items()
-            if entry.ours and entry.sample is not None and not entry.sample.static
-        )
+        found = (known for known in self.entries.values() if known.ours and known.sample is not None)
+        return sorted(known.frame for known in found if known.sample is not None and not known.sample.static)
 
-    def _replaces(self, rank: Rank, sample: TransformStamped | None, known: Entry) -> bool:
+    def _replaces(self, rank: Rank, sample: TransformStamped | None, known: Known) -> bool:
         if rank != (known.number, known.origin):
             return rank > (known.number, known.origin)
         # Two samples of one batch.
         return sample is not None and known.sample is not None and sample.stamp > known.sample.stamp
 
-    def _count(self, origin: bytes, known: Entry | None, sample: TransformStamped | None) -> None:
+    def _count(self, origin: bytes, known: Known | None, sample: TransformStamped | None) -> None:
         if sample is not None and origin != self._own:
             held, most = self._places.held, self._places.max_frames
             if held.get(origin, 0) >= most or self._places.taken >= MANY_ORIGINS * most:
@@ -372,8 +354,9 @@ class Replica:
     def _settle(self, now: float) -> None:
         """Number the settled changes, and take the unsettled ones out of the digest."""
         for frame in self._fresh:
-            self._digest ^= self._digests.pop(frame, 0)
-            self._sequences.pop(frame, None)
+            known = self.entries[frame]
+            self._digest ^= known.digest
+            known.digest = known.sequence = 0
             self._unsettled.pop(frame, None)
             self._unsettled[frame] = now
         self._fresh.clear()
@@ -382,20 +365,19 @@ class Replica:
             if now - self._unsettled[frame] < SETTLING:
                 break
             del self._unsettled[frame]
-            self._number(frame, settled=True)
+            self._number(self.entries[frame], settled=True)
 
-    def _number(self, frame: str, settled: bool = False) -> None:
+    def _number(self, known: Known, settled: bool = False) -> None:
         self._sequence += 1
-        self._sequences[frame] = self._sequence
-        self._log.append((self._sequence, frame))
+        known.sequence = self._sequence
+        self._log.append((self._sequence, known))
         if len(self._log) > 2 * len(self.entries) + _SPARE:
-            self._log = [(number, frame) for number, frame in self._log if self._sequences.get(frame) == number]
-        number, origin, sample, _ = self.entries[frame]
+            self._log = [(number, known) for number, known in self._log if known.sequence == number]
         if settled:
-            rank = b"%b%d %d " % (origin, number, sample is None)
-            digest = int.from_bytes(hash_bytes(rank + frame.encode("utf-8", "surrogatepass"), 8), "little")
-            self._digest ^= digest ^ self._digests.get(frame, 0)
-            self._digests[frame] = digest
+            rank = b"%b%d %d " % (known.origin, known.number, known.sample is None)
+            digest = int.from_bytes(hash_bytes(rank + known.frame.encode("utf-8", "surrogatepass"), 8), "little")
+            self._digest ^= digest ^ known.digest
+            known.digest = digest
 
     def _forget_removals(self) -> None:
         """Forget the removals of the lowest ranks beyond the bound, so that all copies forget the same ones."""
@@ -403,11 +385,11 @@ class Replica:
             rank, frame = heapq.heappop(self._removals)
             if self._is_removed(frame, rank):
                 self._forgive(1)
-                del self.entries[frame]
+                known = self.entries.pop(frame)
+                self._digest ^= known.digest
+                known.sequence = 0
                 self._fresh.pop(frame, None)
                 self._unsettled.pop(frame, None)
-                self._sequences.pop(frame, None)
-                self._digest ^= self._digests.pop(frame, 0)
         if len(self._removals) > 2 * MOST_REMOVALS:
             self._removals = [(rank, frame) for rank, frame in self._removals if self._is_removed(frame, rank)]
             heapq.heapify(self._removals)
@@ -422,14 +404,8 @@ def hash_bytes(data: bytes, size: int) -> bytes:
     return blake2b(data, digest_size=size).digest()
 
 
-def _first(logged: tuple[int, str]) -> int:
+def _first(logged: tuple[int, Known]) -> int:
     return logged[0]
-
-
-def _told(frame: str, entry: Entry) -> OutgoingBatch | RemovedFrame:
-    if entry.sample is None:
-        return RemovedFrame(entry.origin, entry.number, frame)
-    return OutgoingBatch(entry.origin, entry.number, (entry.sample,))
 
 
 @dataclass(eq=False, slots=True)

@@ -8,10 +8,10 @@ Another world, such as ROS, has messages of its own. A link to it (`tfbus.links.
 out and what is news as well; its `Carrier` writes and reads the messages of that world.
 """
 
-import enum
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Any, Final, NamedTuple, Protocol
 
 from tfbus.errors import InvalidTransformError
@@ -42,32 +42,19 @@ class Hearing(NamedTuple):
 
     def matches(self, robot: str) -> bool:
         """Whether a robot has a name of the pattern; in linear time, for strangers choose the names."""
-        first, *others = self.robots.split("*")
-        if not others:
-            return robot == first
-        last = others.pop()
-        if len(robot) < len(first) + len(last) or not robot.startswith(first) or not robot.endswith(last):
-            return False
-        at, end = len(first), len(robot) - len(last)
-        for part in others:
-            # Each part may stand where it first occurs, so nothing is ever tried again.
-            at = robot.find(part, at, end)
-            if at < 0:
-                return False
-            at += len(part)
-        return True
+        return fnmatchcase(robot, self.robots)
 
 
 @dataclass(frozen=True, slots=True)
 class Joined:
-    """A link that this one hears is present; messages that were sent to it before may be lost."""
+    """A peer is present; messages that were sent to it before may be lost."""
 
-    robot: str
+    robot: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Left:
-    """A link has left. No item of it follows, unless it joins again."""
+    """A peer has left. No item of it follows, unless it joins again."""
 
 
 WireItem = bytes | Joined | Left | MalformedMessageError
@@ -157,13 +144,6 @@ class Wire(Protocol):
 # To other worlds
 
 
-class Presence(enum.Enum):
-    """The content of an item that tells that a peer has come or gone."""
-
-    JOINED = enum.auto()
-    LEFT = enum.auto()
-
-
 @dataclass(frozen=True, slots=True)
 class Received:
     """One item that has come.
@@ -173,8 +153,8 @@ class Received:
     sender : str
         The id of the peer; empty if it is unknown.
     content : Any
-        A `Presence`; a `MalformedMessageError` for a message that was refused; or a message, which is decoded on the
-        event loop.
+        `Joined` or `Left`; a `MalformedMessageError` for a message that was refused; or a message, which is decoded on
+        the event loop.
     size : int
         Bytes that the content keeps in memory.
     moving : bool
@@ -277,7 +257,7 @@ class Carrier(Protocol):
         receive : callable
             Takes an item that has come: a peer's message, that a peer has come or gone, or that a message was refused.
             Any thread may call it, from now until `close` has returned and later; it never blocks and never raises.
-            Items are handled in the order of the calls, so a peer's `Presence.LEFT` has to be the last of its items. A
+            Items are handled in the order of the calls, so a peer's `Left` has to be the last of its items. A
             carrier whose network tells nothing of presence leaves presence out.
         report : SendReport
             Counts sent and unsent messages; for the event loop only.

@@ -7,6 +7,7 @@ dropped, and an error of the source is kept for the reader.
 
 import logging
 import math
+import warnings
 from bisect import bisect_left, insort
 from collections import Counter
 from collections.abc import AsyncGenerator, AsyncIterable, Callable, Iterator, Sequence
@@ -36,7 +37,7 @@ from tfbus.errors import (
 )
 from tfbus.frames import is_frame
 from tfbus.geometry.stamped import TransformStamped, answer_of
-from tfbus.registration import Registration
+from tfbus.registration import AsyncOnly, Registration
 from tfbus.rows import IDENTITY
 from tfbus.stamps import LATEST, STAMP_MAX, Latest, as_duration, as_stamp, from_seconds
 from tfbus.tree.lookup import Question
@@ -253,7 +254,7 @@ class Targets(Generic[AnswerT]):
         self._buffer = buffer
         self._one = isinstance(target, str)
         self._names = self._names_of(target)
-        self._tolerance = from_seconds(as_duration(tolerance, "tolerance"))
+        self._tolerance = from_seconds(as_duration(tolerance, "margin"))
 
     def replace(self, target: str | Sequence[str]) -> None:
         """Change the targets; `TypeError` unless both are one frame, or both a sequence."""
@@ -330,7 +331,7 @@ MessageOverflow = Literal["drop_oldest", "drop_newest", "block"]
 """Drop the oldest message, drop the new message, or stop reading the source."""
 
 
-class MessageFilter(Generic[MessageT, AnswerT]):
+class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
     """Pairs each message with its transform: ``async with MessageFilter(...) as pairs: async for message, t in pairs``.
 
     Every message that arrives is delivered once or dropped once, and no drop is silent: `dropped` counts them by
@@ -349,9 +350,9 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         know the target.
     frame, stamp : callable, optional
         Give the frame and the stamp (ns, or `LATEST`) of a message; by default its attributes `frame` and `stamp`.
-    tolerance : float
-        In s. A message is ready only when the transforms at its stamp and this much later are both known. So it demands
-        more, whereas the `tolerance` of a lookup allows more.
+    margin : float
+        In s. A message is ready only when the transforms at its stamp and this much later are both known, as with the
+        ``setTolerance`` of tf2.
     timeout : float, optional
         How long a message may wait, in s on the bus's clock from its arrival; None for ever. A ready message does not
         time out.
@@ -366,6 +367,8 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     on_drop : callable, optional
         Called with a message, the reason, and the error that says what it lacked, or None for a ready message. If it
         raises an `Exception`, that is logged once and counted.
+    tolerance : float, optional
+        The earlier name of `margin`; deprecated, because the `tolerance` of a lookup means the opposite.
 
     Raises
     ------
@@ -395,12 +398,13 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         *,
         frame: Callable[[MessageT], str] | None = None,
         stamp: Callable[[MessageT], int | Latest] | None = None,
-        tolerance: float = 0.0,
+        margin: float = 0.0,
         timeout: float | None = None,
         capacity: int = 100,
         overflow: MessageOverflow = "drop_oldest",
         order: Order = "ready",
         on_drop: Callable[[MessageT, DropReason, TransformError | None], object] | None = None,
+        tolerance: float | None = None,
     ) -> None: ...
 
     @overload
@@ -412,12 +416,13 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         *,
         frame: Callable[[MessageT], str] | None = None,
         stamp: Callable[[MessageT], int | Latest] | None = None,
-        tolerance: float = 0.0,
+        margin: float = 0.0,
         timeout: float | None = None,
         capacity: int = 100,
         overflow: MessageOverflow = "drop_oldest",
         order: Order = "ready",
         on_drop: Callable[[MessageT, DropReason, TransformError | None], object] | None = None,
+        tolerance: float | None = None,
     ) -> None: ...
 
     def __init__(
@@ -428,13 +433,21 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         *,
         frame: Callable[[MessageT], str] | None = None,
         stamp: Callable[[MessageT], int | Latest] | None = None,
-        tolerance: float = 0.0,
+        margin: float = 0.0,
         timeout: float | None = None,
         capacity: int = 100,
         overflow: MessageOverflow = "drop_oldest",
         order: Order = "ready",
         on_drop: Callable[[MessageT, DropReason, TransformError | None], object] | None = None,
+        tolerance: float | None = None,
     ) -> None:
+        if tolerance is not None:
+            warnings.warn(
+                "the tolerance of a MessageFilter is called margin, because that of a lookup means the opposite",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            margin = tolerance
         if not isinstance(messages, AsyncIterable):
             raise TypeError(f"messages must be an async iterable, not {messages!r}")
         if overflow not in ("drop_oldest", "drop_newest", "block"):
@@ -444,7 +457,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
                 raise TypeError(f"{name} must be callable, not {function!r}")
         self.buffer = buffer
         self._messages = messages
-        self._targets: Targets[AnswerT] = Targets(buffer, target, tolerance)
+        self._targets: Targets[AnswerT] = Targets(buffer, target, margin)
         self._frame: Callable[[MessageT], str] = frame or attrgetter("frame")
         self._stamp: Callable[[MessageT], int | Latest] = stamp or attrgetter("stamp")
         self._timeout = math.inf if timeout is None else as_duration(timeout, "timeout")

@@ -7,36 +7,61 @@ import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from tfbus.errors import InvalidTransformError, MissingRecordingError, RecordingError, pip_install
-from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.stamped import TransformStamped, as_batch
 from tfbus.geometry.transform import Transform
 from tfbus.recording.formats.storage import MAX_INDEX, MAX_METADATA
 from tfbus.stamps import is_real
+from tfbus.tree.tree import TransformTree
 
 _SIZES = {"xyz": 3, "rpy": 3, "rpy_deg": 3, "quaternion": 4}
 _SAME = {"translation": "xyz", "rotation": "quaternion"}
 """The names that ``tfbus convert --static-to-yaml`` writes."""
 _ROTATIONS = ("rpy", "rpy_deg", "quaternion")
+_NAMED: Final = 10
 _LONGEST: Final = 1_000
 """The greatest length of an error, in letters."""
 
 
-def save_static(path: str | os.PathLike[str], samples: Iterable[TransformStamped]) -> None:
-    """Write transforms to a file that `load_static` reads, as JSON, which is YAML as well.
+class HasTree(Protocol):
+    """An object with a tree, such as a `tfbus.Buffer`."""
+
+    @property
+    def tree(self) -> TransformTree:
+        """The tree."""
+
+
+def save_static(path: str | os.PathLike[str], source: HasTree | TransformTree | Iterable[TransformStamped]) -> None:
+    """Write static transforms to a file that `load_static` reads, as JSON, which is YAML as well.
 
     Parameters
     ----------
     path : path
-    samples : iterable of TransformStamped
-        Their rotations are written as quaternions x, y, z, w, to the last bit.
+    source : Buffer, TransformTree, or iterable of TransformStamped
+        Of a buffer or a tree, all static frames are written, with the names of the bus. Rotations are written as
+        quaternions x, y, z, w, to the last bit.
 
     Raises
     ------
+    ValueError
+        If a sample moves, or a tree has moving frames only; the message names them. Nothing is written.
     OSError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> tree = TransformTree()
+    >>> outcome = tree.insert(TransformStamped("base_link", "laser", 0, Transform((0.1, 0.0, 0.2)), static=True))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder, "calibration.json")
+    ...     save_static(file, tree)
+    ...     [(sample.parent, sample.child) for sample in load_static(file)]
+    [('base_link', 'laser')]
     """
+    samples = _static_samples(source)
     lines = [
         json.dumps(
             {
@@ -52,6 +77,25 @@ def save_static(path: str | os.PathLike[str], samples: Iterable[TransformStamped
     ]
     text = "[\n  " + ",\n  ".join(map(_escaped, lines)) + "\n]\n" if lines else "[]\n"
     Path(path).write_text(text, encoding="utf-8")
+
+
+def _static_samples(source: HasTree | TransformTree | Iterable[TransformStamped]) -> list[TransformStamped]:
+    tree = source if isinstance(source, TransformTree) else getattr(source, "tree", None)
+    if isinstance(tree, TransformTree):
+        edges = tree.edges()
+        found = [tree.samples_around(edge.child, 0)[0] for edge in edges if edge.static]
+        samples = [sample for sample in found if sample is not None]
+        moving = [] if samples else [edge.child for edge in edges]
+    elif isinstance(source, Iterable):
+        samples = list(as_batch(source))
+        moving = [sample.child for sample in samples if not sample.static]
+    else:
+        raise TypeError(f"expected a buffer, a tree or samples, not {source!r}")
+    if moving:
+        named = ", ".join(map(repr, dict.fromkeys(moving[:_NAMED])))
+        more = f" and {len(moving) - _NAMED} more" if len(moving) > _NAMED else ""
+        raise ValueError(f"only static transforms are saved, but these move: {named}{more}")
+    return samples
 
 
 def _escaped(line: str) -> str:
@@ -82,6 +126,11 @@ def load_static(path: str | os.PathLike[str], *, authority: str = "") -> list[Tr
         the message has its number. For a missing file, the error is a `FileNotFoundError` as well.
     ImportError
         If YAML beyond JSON needs the extra: ``pip install "tfbus[bag]"``.
+
+    Examples
+    --------
+    >>> def publish_calibration(bus: Bus) -> None:
+    ...     bus.publish(load_static("calibration.yaml", authority="calibration"))
     """
     file = Path(path)
     try:

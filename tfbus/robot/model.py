@@ -553,8 +553,6 @@ def read_visuals(source: str | os.PathLike[str]) -> list[Visual]:
         if each.tag != "link":
             continue
         for found in each.value.visuals:
-            if found.geometry is None:
-                continue
             colour = None
             if found.material is not None:
                 colour = _colour(found.material, each.label) or colours.get(found.material.name)

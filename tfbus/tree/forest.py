@@ -34,7 +34,7 @@ from tfbus.geometry.stamped import Batch, QualifiedTransform, TransformStamped
 from tfbus.rows import IDENTITY, Row, compose, invert
 from tfbus.stamps import LATEST, STAMP_MIN, Latest, as_stamp
 from tfbus.tree.cycles import Frames, Loop, admit, edges_above, names_below, past_loop
-from tfbus.tree.history import FrameHistory, Outcome, SavedFrame, load_frame
+from tfbus.tree.history import FrameHistory, Outcome, SavedFrame, clear_samples, load_frame
 from tfbus.which_kernel import Chain, Paths, commit
 
 
@@ -71,17 +71,21 @@ class KnownFrames:
 
     def update(self, child: str, parents: tuple[str, ...]) -> None:
         """Note that the samples of `child` name exactly these parents."""
-        before = self._parents_of.get(child)
+        parents_of, mentions = self._parents_of, self._mentions
+        before = parents_of.get(child)
         if before == parents:
             return
         for parent in parents:
-            self._mentions[parent] = self._mentions.get(parent, 0) + 1
-            if parent not in self._parents_of:
+            mentioned = mentions.get(parent, 0)
+            mentions[parent] = mentioned + 1
+            if not mentioned and parent not in parents_of:
                 self._roots.add(parent)
-        self._forget_mentions(before or ())
         self.changing += len(parents) > 1
-        self._parents_of[child] = parents
-        self._roots.discard(child)
+        parents_of[child] = parents
+        if before is None:
+            self._roots.discard(child)
+        else:
+            self._forget_mentions(before)
         self._sorted = self._some = None
 
     def remove(self, child: str) -> None:
@@ -466,6 +470,42 @@ _CHANGING_PATHS_KEPT = 5_000
 T = TypeVar("T")
 
 
+class StaticFrames:
+    """The static edges of a bus, of which none is in a loop. All forests that begin with them share their histories.
+
+    Attributes
+    ----------
+    samples : dict of str to TransformStamped
+        By child.
+    histories : dict of str to FrameHistory
+        Each is replaced rather than changed.
+    names : KnownFrames
+        The frames that the samples name.
+    """
+
+    def __init__(self) -> None:
+        self.samples: dict[str, TransformStamped] = {}
+        self.histories: dict[str, FrameHistory] = {}
+        self.names = KnownFrames()
+
+    def put(self, sample: TransformStamped) -> None:
+        """Add a sample, or replace the one of its child."""
+        parent, child, stamp, row, authority, _ = sample._fields
+        self.samples[child] = sample
+        self.histories[child] = history = FrameHistory(child, parent, True, None)
+        history.static_stamp = stamp
+        history.static_row = row
+        history.authority = authority
+        history.shared = True
+        self.names.update(child, (parent,))
+
+    def remove(self, child: str) -> None:
+        """Forget a child, if it is static."""
+        if self.samples.pop(child, None) is not None:
+            del self.histories[child]
+            self.names.remove(child)
+
+
 class LoopingSample(NamedTuple):
     """A sample that is part of a loop of parents at a past stamp."""
 
@@ -633,11 +673,15 @@ class Forest:
         parent, child, stamp, row, authority, static = sample._fields
         history = self.frames.get(child)
         if history is None:
-            history = self._add_frame(child, parent, static)
+            history = self._add_frame(sample)
             if child in self.changed:
                 self._suspects.append(sample)
+        elif history.shared:
+            history = self.frames[child] = history.copy_within(self.window)
+            # The paths hold the shared one.
+            self.forget_paths()
         if static:
-            if row != history.static_row:
+            if history.static_stamp is not None and row != history.static_row:
                 # The paths hold the rows of static edges.
                 self.forget_paths()
             outcome = history.insert_static(parent, stamp, row, authority)
@@ -672,12 +716,20 @@ class Forest:
         """Drop all moving samples. Static ones and names stay."""
         with self.lock:
             self.version += 1
-            for history in self.frames.values():
+            for history in clear_samples(self.frames.values()):
                 history.clear()
                 history.changed = False
                 self.names.update(history.child, history.named_parents)
             self.forget_paths()
             self._tell_readers(self.frames)
+
+    def share(self, static: "StaticFrames") -> None:
+        """Hold the static edges of a bus; this forest is empty."""
+        with self.lock:
+            self.version += 1
+            self.frames.update(static.histories)
+            self.names = static.names.copy()
+            self.inserted += len(static.histories)
 
     def find_past_loops(self) -> None:
         """Note which of the samples since the last call are part of a loop of parents at a past stamp.
@@ -889,9 +941,11 @@ class Forest:
 
     # Bookkeeping
 
-    def _add_frame(self, child: str, parent: str, static: bool) -> FrameHistory:
+    def _add_frame(self, sample: TransformStamped) -> FrameHistory:
+        parent, child, _, _, _, static = sample._fields
         has_children = child in self.names
-        history = self.frames[child] = FrameHistory(child, parent, static, self.window)
+        history = FrameHistory(child, parent, static, self.window)
+        self.frames[child] = history
         self.names.update(child, history.named_parents)
         self.new_parents.add(parent)
         if has_children:

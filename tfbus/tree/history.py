@@ -6,12 +6,13 @@ a frame may be reparented; parents and authorities are stored as runs of samples
 """
 
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from itertools import groupby
 from operator import itemgetter
-from typing import NamedTuple, final
+from typing import Final, NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
@@ -32,85 +33,76 @@ from tfbus.which_kernel import History
 _begin_of = itemgetter(0)
 
 
-class Runs:
+class Runs(list[tuple[int, str]]):
     """The parents, or the authorities, of the samples of a history: one name for each run of samples that share it.
 
-    It is empty, and false, while all samples have the same name. The history holds the name of its newest sample.
+    Each name stands behind the stamp from which it holds, in order. The first one holds from any earlier stamp as well.
+    The list is empty while all samples have the same name. The history holds the name of its newest sample.
+
+    Histories share one empty list, `NO_RUNS`. So `push` and `put` leave an empty list as it is, and return another.
     """
 
-    __slots__ = ("_runs",)
-
-    def __init__(self) -> None:
-        # The stamp from which each name holds, in order. The first one holds from any earlier stamp as well.
-        self._runs: list[tuple[int, str]] = []
-
-    def __bool__(self) -> bool:
-        return bool(self._runs)
+    __slots__ = ()
 
     def at(self, stamp: int) -> str:
         """The name that holds at a stamp; there are several."""
-        return self._runs[max(bisect_right(self._runs, stamp, key=_begin_of) - 1, 0)][1]
+        return self[max(bisect_right(self, stamp, key=_begin_of) - 1, 0)][1]
 
     def at_all(self, stamps: Stamps) -> list[str]:
         """The names that hold at many stamps."""
-        begins = np.array([begin for begin, _ in self._runs], np.int64)
+        begins = np.array([begin for begin, _ in self], np.int64)
         numbers = np.maximum(begins.searchsorted(stamps, "right") - 1, 0)
-        return [self._runs[number][1] for number in numbers]
+        return [self[number][1] for number in numbers]
 
     def names(self) -> tuple[str, ...]:
         """Each name once, in the order in which they first hold."""
-        return tuple(dict.fromkeys(name for _, name in self._runs))
+        return tuple(dict.fromkeys(name for _, name in self))
 
     def changes(self) -> list[int]:
         """The stamps at which another name begins to hold."""
-        return [begin for begin, _ in self._runs[1:]]
+        return [begin for begin, _ in self[1:]]
 
-    def push(self, stamp: int, name: str, newest: str) -> None:
-        """Note the name of a sample that is newer than all others; the newest of the others has the name `newest`."""
-        if name != newest:
-            if not self._runs:
-                self._runs.append((STAMP_MIN, newest))
-            self._runs.append((stamp, name))
+    def push(self, stamp: int, name: str, newest: str) -> "Runs":
+        """The names with that of a sample newer than all others, of which the newest has the name `newest`."""
+        if name == newest:
+            return self
+        runs = self or Runs([(STAMP_MIN, newest)])
+        runs.append((stamp, name))
+        return runs
 
-    def put(self, stamp: int, name: str, before: int | None, after: int | None, newest: str) -> None:
-        """Note the name of a sample between two others; None for a side without a sample. `newest` is as in `push`."""
-        if not self._runs:
-            if name == newest:
-                return
-            self._runs.append((STAMP_MIN, newest))
-        runs = self._runs
+    def put(self, stamp: int, name: str, before: int | None, after: int | None, newest: str) -> "Runs":
+        """The names with that of a sample between two others; None for a side without one. `newest` is as in `push`."""
+        if not self and name == newest:
+            return self
+        runs = self or Runs([(STAMP_MIN, newest)])
         low = 0 if before is None else bisect_right(runs, before, key=_begin_of)
         high = len(runs) if after is None else bisect_right(runs, after, key=_begin_of)
         fresh = [] if low and runs[low - 1][1] == name else [(stamp, name)]
         if after is not None and runs[high - 1][1] != name:
             fresh.append((after, runs[high - 1][1]))
         runs[low:high] = fresh
-        self._close()
+        runs._close()
+        return runs
 
     def forget_before(self, oldest: int) -> bool:
         """Forget the names that only samples before a stamp carry; returns whether there were any."""
-        runs = self._runs
         old = 0
-        while old + 1 < len(runs) and runs[old + 1][0] <= oldest:
+        while old + 1 < len(self) and self[old + 1][0] <= oldest:
             old += 1
-        del runs[:old]
+        del self[:old]
         self._close()
         return old > 0
 
-    def clear(self) -> None:
-        """Forget all names."""
-        self._runs.clear()
-
     def copy(self) -> "Runs":
         """An independent copy."""
-        twin = Runs()
-        twin._runs = self._runs.copy()
-        return twin
+        return Runs(self) if self else NO_RUNS
 
     def _close(self) -> None:
-        if len(self._runs) == 1:
-            self._runs.clear()
+        if len(self) == 1:
+            self.clear()
 
+
+NO_RUNS: Final = Runs()
 
 _BLOCK = 64
 """Up to this many samples for each stamp, copying all samples is faster than picking some."""
@@ -219,9 +211,11 @@ class FrameHistory(History):
     changed : bool
         Set by an insertion that may change the path of a lookup: another parent or kind, or a longer past. The forest
         clears it.
+    shared : bool
+        Whether several forests hold this static history. They only read it, and insert into a copy of their own.
     """
 
-    __slots__ = ("_authorities", "_parents", "changed", "child", "static", "static_row")
+    __slots__ = ("_authorities", "_parents", "changed", "child", "shared", "static", "static_row")
 
     def __init__(self, child: str, parent: str, static: bool, keep: int | None) -> None:
         super().__init__(parent, keep)
@@ -229,8 +223,9 @@ class FrameHistory(History):
         self.static = static
         self.static_row: Row = IDENTITY
         self.changed = False
-        self._parents = Runs()
-        self._authorities = Runs()
+        self.shared = False
+        self._parents = NO_RUNS
+        self._authorities = NO_RUNS
 
     def __len__(self) -> int:
         return 1 if self.static else self.count
@@ -265,8 +260,8 @@ class FrameHistory(History):
             self.static_stamp = None
             self.changed = True
         if newest is not None:
-            self._parents.push(stamp, parent, self.parent)
-            self._authorities.push(stamp, authority, self.authority)
+            self._parents = self._parents.push(stamp, parent, self.parent)
+            self._authorities = self._authorities.push(stamp, authority, self.authority)
             if self._parents or self._authorities:
                 self._forget_old_names()
         if parent != self.parent:
@@ -291,8 +286,7 @@ class FrameHistory(History):
     def clear(self) -> None:
         """Drop all moving samples; the newest parent is remembered."""
         super().clear()
-        self._parents.clear()
-        self._authorities.clear()
+        self._parents = self._authorities = NO_RUNS
         if self.mixed:
             self.mixed = False
             self.changed = True
@@ -436,9 +430,9 @@ class FrameHistory(History):
         behind = at + replaces
         after = self.stamp(behind) if behind < self.count else None
         self.put(at, stamp, row)
-        self._authorities.put(stamp, authority, before, after, self.authority)
+        self._authorities = self._authorities.put(stamp, authority, before, after, self.authority)
         if self.mixed or parent != self.parent:
-            self._parents.put(stamp, parent, before, after, self.parent)
+            self._parents = self._parents.put(stamp, parent, before, after, self.parent)
             self.mixed = bool(self._parents)
             self.changed = True
         if is_newest:
@@ -454,6 +448,16 @@ class FrameHistory(History):
             if self._parents.forget_before(oldest):
                 self.changed = True
         self.mixed = bool(self._parents)
+
+
+def clear_samples(histories: Collection[FrameHistory]) -> list[FrameHistory]:
+    """Drop the moving samples of many histories; return the ones that need `clear` yet, for their samples' many names.
+
+    A clock that jumps back clears all frames in one turn of the event loop, so the usual ones are cleared without
+    calling a method in Python.
+    """
+    deque(map(History.clear, histories), maxlen=0)
+    return [history for history in histories if history.mixed or history._authorities]
 
 
 STALE_AFTER = 1.0

@@ -57,7 +57,12 @@ def test_a_domain_is_examined_for_some_time(tfbus: Command) -> None:
         bus.publish(moving("map", "base", START + SECOND // 4))
         await bus.clock.sleep(100.0)
 
-    done = tfbus.on_domain(robot, "check", "yard", "--duration", "3", "--json")
-    assert done.returncode == 1
-    assert "listening to domain 'yard' for 3 s" in done.stderr
-    assert [finding["kind"] for finding in json.loads(done.stdout)] == ["stamps go back", "ahead"]
+    for words, place in (
+        (("yard",), "domain 'yard'"),
+        (("--domain", "yard"), "domain 'yard'"),
+        (("--ros", "dds:42"), "ROS at dds:42"),
+    ):
+        done = tfbus.on_domain(robot, "check", *words, "--duration", "3", "--json")
+        assert done.returncode == 1
+        assert f"listening to {place} for 3 s" in done.stderr
+        assert [finding["kind"] for finding in json.loads(done.stdout)] == ["stamps go back", "ahead"]

@@ -29,7 +29,7 @@ def test_the_name_of_the_output_decides_its_kind(
 ) -> None:
     output = tmp_path / f"picture.{kind}"
     done = tfbus("plot", recording, "map", "base", "laser", "-o", output)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", f"wrote {output}\n")
     assert output.read_bytes().startswith(begin)
 
 
@@ -52,7 +52,7 @@ def test_every_picture_is_drawn(
 ) -> None:
     output = tmp_path / "picture.svg"
     done = tfbus("plot", recording, *options, "-o", output)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.returncode, done.stderr) == (0, f"wrote {output}\n")
     assert [text for text in texts if f"<!-- {text} -->" not in texts_of(output)] == []
     assert ("<!-- laser -->" in texts_of(output)) is ("laser" in texts)
 

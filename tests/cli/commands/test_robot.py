@@ -12,7 +12,7 @@ from support.commands import START, Command, check_wrong_call, nobody
 from support.processes import start_tfbus, until
 
 from tfbus import SECOND, Buffer, Bus, RobotModel, TransformStamped
-from tfbus.cli.commands import robot
+from tfbus.cli import domain
 from tfbus.cli.commands.robot import tree_lines
 
 CRANE = """<?xml version="1.0"?>
@@ -209,11 +209,15 @@ class Ros:
     def __init__(self, description: str) -> None:
         self._description = description
         self.asked: list[tuple[str, str, object, object]] = []
+        self.topics: list[object] = []
 
     @asynccontextmanager
-    async def link(self, _: Bus, place: str, *, send: bool, frames: object, **takes: Any) -> AsyncIterator[None]:
-        ((what, take),) = takes.items()
+    async def link(
+        self, _: Bus, place: str, *, send: bool, frames: object, prefix: object, **options: Any
+    ) -> AsyncIterator[None]:
+        ((what, take),) = ((name, option) for name, option in options.items() if callable(option))
         self.asked.append((place, what, send, frames))
+        self.topics += [prefix, options.get("joint_topic"), options.get("description_topic")]
         if what == "robot_description":
             take(self._description)
         else:
@@ -223,7 +227,7 @@ class Ros:
 
 def test_ros_describes_a_robot_and_moves_it(tfbus: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     ros, found = Ros(CRANE), list[TransformStamped]()
-    monkeypatch.setattr(robot, "ros_link", ros.link)
+    monkeypatch.setattr(domain, "ros_link", ros.link)
 
     async def ask(bus: Bus) -> None:
         with Buffer(bus) as buffer:
@@ -236,6 +240,9 @@ def test_ros_describes_a_robot_and_moves_it(tfbus: Command, monkeypatch: pytest.
         "publishing the frames of 'crane' as /joint_states of ROS at dds:7 says, until Ctrl-C",
     ]
     assert ros.asked == [("dds:7", "robot_description", False, ()), ("dds:7", "joint_states", False, ())]
+    assert ros.topics == [None] * 6
+    tfbus.on_domain(ask, "robot", "--follow", "--ros", "dds", "--tf", "/r1/tf", "--tf-prefix", "r1/", "--prefix", "r1/")
+    assert ros.topics[6:] == ["r1/", "/r1/joint_states", "/r1/robot_description"] * 2
     assert found[0].stamp == 5 * SECOND
     assert found[0].transform.as_rpy()[2] == pytest.approx(0.5)
 
@@ -246,7 +253,7 @@ def test_ros_describes_a_robot_and_moves_it(tfbus: Command, monkeypatch: pytest.
 def test_a_description_of_ros_that_is_none_is_a_usage_error(
     tfbus: Command, monkeypatch: pytest.MonkeyPatch, text: str, why: str
 ) -> None:
-    monkeypatch.setattr(robot, "ros_link", Ros(text).link)
+    monkeypatch.setattr(domain, "ros_link", Ros(text).link)
     done = tfbus.on_domain(nobody, "robot", "--follow", "--ros", "dds")
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1].startswith(f"tfbus: {why}")

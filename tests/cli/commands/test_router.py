@@ -1,6 +1,5 @@
 import errno
 import os
-import socket
 from pathlib import Path
 
 import pytest
@@ -72,10 +71,3 @@ def test_a_file_of_settings_that_cannot_be_used_is_a_usage_error(tfbus: Command,
     check_wrong_call(tfbus("router", "--config", file), f"cannot read {file}: {os.strerror(errno.ENOENT)}")
     file.write_text("{no: 1}", encoding="utf-8")
     check_wrong_call(tfbus("router", "--config", file), f"zenoh does not take the settings in {file}: unknown field")
-
-
-def test_an_address_in_use_is_a_usage_error(tfbus: Command) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        address = f"tcp/127.0.0.1:{server.getsockname()[1]}"
-        done = tfbus("router", "--listen", address)
-    check_wrong_call(done, f"cannot listen at {address}: {os.strerror(errno.EADDRINUSE)}")

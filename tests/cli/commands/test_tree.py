@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from support.commands import START, Command, check_wrong_call
+from support.recorded import write_mcap
 from support.samples import moving, static
 
 from tfbus import SECOND, Bus
@@ -129,6 +130,30 @@ def test_it_says_what_it_could_not_see_within_five_seconds(tfbus: Command) -> No
     assert json.loads(tfbus.on_domain(publish_once, "tree", "--json", "--duration", "2").stdout)["stamp"] == (
         START + 2 * SECOND
     )
+
+
+def test_the_tree_of_a_recording_is_shown_with_ages_before_its_newest_stamp(tfbus: Command, tmp_path: Path) -> None:
+    lines = [(number * SECOND, "/tf", [moving("map", "base", number * SECOND)]) for number in range(3)]
+    lines += [(SECOND, "/tf_static", [static("base", "laser")]), (SECOND, "/tf", [moving("map", "slow", SECOND)])]
+    path, dot = write_mcap(tmp_path / "run.mcap", lines), tmp_path / "frames.dot"
+    done = tfbus("tree", path, "--dot", dot, "--prefix", "r1/")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines() == [
+        "r1/map",
+        "├── r1/base       1.0 Hz  age 0 ns  span 2 s",
+        "│   └── r1/laser  static",
+        "└── r1/slow       one sample  age 1 s  span 0 ns",
+    ]
+    assert '"r1/map" -> "r1/base"' in dot.read_text()
+    document = json.loads(tfbus("tree", path, "--json").stdout)
+    assert (document["file"], document["stamp"], document["frames"]["slow"]["age"]) == (str(path), 2 * SECOND, 1.0)
+
+
+@pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
+def test_the_tree_of_a_recording_is_drawn(tfbus: Command, tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [(SECOND, "/tf", [moving("map", "base", SECOND)])])
+    assert tfbus("tree", path, "--svg", tmp_path / "frames.svg").returncode == 0
+    assert ">base<" in (tmp_path / "frames.svg").read_text(encoding="utf-8")
 
 
 def test_without_graphviz_the_error_says_what_to_install(

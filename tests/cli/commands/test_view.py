@@ -20,21 +20,16 @@ ROBOT = Path(__file__).parents[3] / "demos" / "robot_arm.urdf"
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_the_page_of_a_recording_is_served_until_ctrl_c(backend: str) -> None:
-    with start_tfbus("view", str(SMALL), "--urdf", str(ROBOT), "--port", "0", "--backend", backend) as view:
+@pytest.mark.parametrize("of", [(str(SMALL), "--urdf", str(ROBOT)), ("--domain", "DOMAIN", "--listen", "ADDRESS")])
+def test_the_page_of_a_recording_or_of_a_domain_is_served_until_ctrl_c(of: tuple[str, ...], backend: str) -> None:
+    places = {"DOMAIN": new_domain(), "ADDRESS": free_address()}
+    options = (places.get(word, word) for word in of)
+    with start_tfbus("view", *options, "--port", "0", "--backend", backend) as view:
         address = view.output.expect("http://127.0.0.1:")
         assert httpx.get(address, trust_env=False).status_code == 200
         assert view.end(signal.SIGINT) == 130
     assert view.output.text == f"{address}\n"
     assert view.errors.text.endswith("\nopen this address in a browser; Ctrl-C ends it\n")
-
-
-@pytest.mark.thorough
-def test_the_page_of_a_domain_is_served_until_ctrl_c() -> None:
-    with start_tfbus("view", "--port", "0", "--domain", new_domain(), "--listen", free_address()) as view:
-        address = view.output.expect("http://127.0.0.1:")
-        assert httpx.get(address, trust_env=False).status_code == 200
-        assert view.end(signal.SIGINT) == 130
 
 
 def test_a_recording_is_no_live_page_and_has_the_options_of_the_command(

@@ -1,4 +1,5 @@
 import math
+import os
 import struct
 import sys
 from collections.abc import AsyncIterator, Iterator
@@ -18,6 +19,7 @@ from support.samples import latched, moving, static
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
 from cyclonedds.core import DDSException
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
@@ -100,6 +102,26 @@ async def test_a_message_waits_for_the_name_of_its_node_only_a_while_and_longer_
             node.tell_name("/", "late")
             await end.until_heard("camera", "lidar")
     assert [sample.authority for sample in end.heard] == [other.id, "/late"]
+
+
+async def test_a_program_that_is_no_node_is_the_authority_by_the_name_of_its_participant(domain_number: int) -> None:
+    async with joined(domain_number) as end:
+        with DdsNode(domain_number, name="planner") as node, DdsNode(domain_number, name="x" * 1_000) as long:
+            node.say(static("map", "lidar"), topic="rt/tf_static")
+            await end.until_heard("lidar")
+            long.say(static("map", "camera"), topic="rt/tf_static")
+            await end.until_heard("lidar", "camera")
+    assert [sample.authority for sample in end.heard] == ["planner", "x" * 256]
+
+
+async def test_others_see_the_name_of_the_program_of_a_link_and_its_process(domain_number: int) -> None:
+    with DdsNode(domain_number) as node:
+        reader = BuiltinDataReader(node.participant, BuiltinTopicDcpsParticipant)
+        async with joined(domain_number):
+            await until(lambda: any(readers.name_of(each).startswith("tfbus ") for each in readers.read(reader)))
+            names = {readers.name_of(each) for each in readers.read(reader)}
+        readers.delete(reader)
+    assert names == {"", f"tfbus {Path(sys.argv[0]).name} [{os.getpid()}]"}
 
 
 async def test_a_participant_is_a_peer_while_it_publishes_on_any_topic(domain_number: int) -> None:

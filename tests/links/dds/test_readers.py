@@ -98,7 +98,7 @@ def test_who_joins_waits_for_the_programs_of_ros_that_answer_and_for_a_writer_of
         ("BuiltinDataReader", lambda _, topic: topic),
         ("read", found),
         ("delete", deleted.append),
-        ("DomainParticipant", lambda _: next(made)),
+        ("DomainParticipant", lambda *_: next(made)),
     ):
         monkeypatch.setattr(readers, name, fake)
     with ExitStack() as stack:
@@ -315,6 +315,9 @@ class Hall:
 
     def is_of_ros(self, participant: str) -> bool:
         return participant == "ros"
+
+    def name_of(self, participant: str) -> str:
+        return participant
 
     def say(self, publisher: str, payload: bytes = b"x", static: bool = False, participant: str = "p") -> None:
         self.publishers.message(publisher, participant, payload, static)

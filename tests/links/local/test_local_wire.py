@@ -3,6 +3,7 @@
 import gc
 import os
 import resource
+import select
 import selectors
 import shutil
 import signal
@@ -13,7 +14,7 @@ import tempfile
 import threading
 import tracemalloc
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
 from pathlib import Path
 from random import Random
 from time import thread_time
@@ -28,6 +29,7 @@ from support.local_links import RawPeer, files_in, framed
 from support.processes import OPEN_FILES, Program, on_one_loop, until
 from support.wires import HEARS_ALL, Ear, met, running
 
+from tfbus.links.local import local_wire
 from tfbus.links.local.local_wire import MOST_STRANGERS, MOST_UNFINISHED, LocalWire
 from tfbus.links.seams import MAX_MESSAGE, Left
 
@@ -272,6 +274,29 @@ async def test_of_many_strangers_the_oldest_make_room(directory: str) -> None:
         await ear.joined(strangers[-1].link)
 
 
+async def test_a_link_makes_and_takes_so_many_connections_and_no_more(
+    directory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(local_wire, "MOST_CONNECTIONS", 2)
+    with ExitStack() as stack:
+        async with running(LocalWire(DOMAIN, directory=directory)) as ear:
+            (path,) = files_in(directory)
+            deaf = [stack.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(3)]
+            for number, each in enumerate(deaf):
+                each.bind(str(path.with_name(f"{path.name.partition('-')[0]}-{number:024x}")))
+                each.listen()
+            await until(lambda: bool(ear.warnings))
+            assert len(select.select(deaf, [], [], 0.0)[0]) == 2
+            late = await RawPeer.connect(path)
+            async with late.stream:
+                assert await late.end() == []
+            stack.close()
+            peer = await RawPeer.connect(path)
+            async with peer.stream:
+                await peer.meet()
+                await ear.joined(peer.link)
+
+
 @pytest.mark.thorough
 @on_one_loop
 async def test_a_stranger_that_says_nothing_is_sent_away(directory: str) -> None:
@@ -442,8 +467,7 @@ async def test_a_file_at_which_nobody_listens_is_removed(directory: str, loopbac
             else:
                 with socket.socket(socket.AF_UNIX) as dead:
                     dead.bind(str(path.with_name(name)))
-        if not loopback:
-            path.with_name(f"{domain}-{'0' * 23}1").write_text("no socket")
+        path.with_name(f"{domain}-{'0' * 23}1").write_text("no socket, no port")
         younger = LocalWire(DOMAIN, directory=directory, loopback=loopback)
         async with running(younger) as ear:
             await ear.joined(elder.id)

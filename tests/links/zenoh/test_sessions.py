@@ -20,7 +20,6 @@ from tfbus.links.zenoh.sessions import (
     Addresses,
     client_config,
     endpoints,
-    open_client,
     open_session,
     router_config,
 )
@@ -170,7 +169,7 @@ def test_an_os_error_that_only_zenoh_has_found_has_no_number() -> None:
 
 def test_a_router_that_is_not_there_is_an_os_error() -> None:
     with pytest.raises(OSError, match="zenoh cannot open a session"):
-        open_client(client_config(ROUTER, None, None), free_address())
+        open_session(client_config(free_address(), None, None))
 
 
 # TLS and access control

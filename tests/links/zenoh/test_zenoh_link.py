@@ -5,7 +5,6 @@ import sys
 import threading
 import weakref
 
-import anyio
 import pytest
 from support.processes import Program, until
 
@@ -45,16 +44,3 @@ async def test_links_that_have_ended_are_freed_with_their_threads(address: str, 
             assert len(ended) == 0
             assert threading.active_count() <= threads
             assert own.statistics().frames == 11
-
-
-@pytest.mark.thorough
-@pytest.mark.every_loop
-async def test_a_link_that_is_cancelled_while_it_begins_to_listen_frees_its_address(address: str, domain: str) -> None:
-    for tenths in range(60):
-        with Bus() as bus, anyio.move_on_after(tenths / 10_000) as scope:
-            async with ZenohLink(bus, domain, listen=address):
-                await anyio.sleep_forever()
-        assert scope.cancelled_caught
-    with Bus() as bus:
-        async with ZenohLink(bus, domain, listen=address):
-            pass

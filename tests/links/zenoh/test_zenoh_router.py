@@ -7,10 +7,10 @@ import pytest
 import zenoh
 from support.processes import free_address, until
 from support.wires import LIVE, Ear, met
-from support.zenoh_wires import Way, listening, start_router, talk, way_to
+from support.zenoh_wires import listening, start_router, talk, way_to
 
 from tfbus.links.seams import Joined, Left
-from tfbus.links.zenoh import zenoh_router
+from tfbus.links.zenoh import wire
 from tfbus.links.zenoh.neighbours import Neighbours
 from tfbus.links.zenoh.sessions import router_config
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
@@ -37,22 +37,19 @@ async def test_routers_that_connect_to_each_other_tell_each_other_all_after_each
     async with way_to(other) as way, way_to(address) as back:
         with start_router(address, way.address), start_router(other, back.address):
             async with listening(domain, connect=address) as one, listening(domain, connect=other) as two:
-                await hear_each_other_after_each_break(one, two, way, back)
+                for _ in range(3):
+                    await met(one, two)
+                    await talk(one, two)
+                    starts = len(one.items), len(two.items)
+                    await way.cut(far_only=True)
+                    await back.cut()
+                    await until(lambda starts=starts: has_lost(one, starts[0]) or has_lost(two, starts[1]))  # type: ignore[misc]
+                await met(one, two)
+                await talk(one, two)
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("anyio_backend", ["asyncio"])
-async def test_links_that_listen_and_connect_to_each_other_hear_each_other_after_each_break(
-    address: str, domain: str
-) -> None:
-    other = free_address()
-    async with (
-        way_to(other) as way,
-        way_to(address) as back,
-        listening(domain, listen=address, connect=way.address, lease=1.0) as one,
-        listening(domain, listen=other, connect=back.address, lease=1.0) as two,
-    ):
-        await hear_each_other_after_each_break(one, two, way, back)
+def has_lost(ear: Ear, start: int) -> bool:
+    return Left() in [item for _, item in ear.items[start:]]
 
 
 @pytest.mark.thorough
@@ -73,22 +70,6 @@ async def test_routers_in_a_ring_tell_each_other_all_after_breaks_that_follow_fa
                     await way.cut()
         await met(*ears)
         await talk(*ears)
-
-
-async def hear_each_other_after_each_break(one: Ear, two: Ear, way: Way, back: Way) -> None:
-    for _ in range(3):
-        await met(one, two)
-        await talk(one, two)
-        before = len(one.items), len(two.items)
-        await way.cut(far_only=True)
-        await back.cut()
-        await until(
-            lambda before=before: any(  # type: ignore[misc]
-                Left() in [item for _, item in ear.items[start:]] for ear, start in zip((one, two), before, strict=True)
-            )
-        )
-    await met(one, two)
-    await talk(one, two)
 
 
 async def test_a_router_listens_at_several_addresses(address: str, domain: str) -> None:
@@ -118,9 +99,9 @@ async def test_a_router_whose_session_breaks_at_once_says_so_at_first_and_later_
     breaks: str, address: str, domain: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kinds: list[Any] = [Broken] if breaks == "at first" else [Silent, Broken]
-    monkeypatch.setattr(zenoh_router, "Neighbours", lambda session: (kinds.pop(0) if kinds else Neighbours)(session))
+    monkeypatch.setattr(wire, "Neighbours", lambda session: (kinds.pop(0) if kinds else Neighbours)(session))
     if breaks == "at first":
-        with pytest.raises(OSError, match="the session of a router broke at once: closed"):
+        with pytest.raises(OSError, match="the session with a router broke at once: closed"):
             async with ZenohRouter(address):
                 raise AssertionError("it has opened")
     async with (
@@ -206,12 +187,3 @@ async def test_a_router_whose_opening_is_cancelled_at_any_moment_frees_its_addre
                 await anyio.sleep_forever()
     async with ZenohRouter(address):
         pass
-
-
-async def test_what_makes_no_sense_is_refused_at_once() -> None:
-    with pytest.raises(ValueError, match="garbage"):
-        ZenohRouter("garbage")
-    with pytest.raises(ValueError, match="'no'"):
-        ZenohRouter(config={"no": 1})
-    with pytest.raises(ValueError, match="lease"):
-        ZenohRouter(lease=0.0)

@@ -33,11 +33,7 @@ from support.samples import moving, static
 from tfbus import RecordingError
 from tfbus.recording import RecordedMessage, open_recording
 from tfbus.recording.formats import mcap_records
-from tfbus.recording.formats.mcap_records import (
-    Chunk,
-    read_records,
-    record_places,
-)
+from tfbus.recording.formats.mcap_records import Chunk, read_records, record_places
 from tfbus.recording.formats.storage import UnfoldError
 from tfbus.stamps import STAMP_MAX
 from tfbus.tf_message import encode

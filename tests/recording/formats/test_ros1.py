@@ -17,14 +17,7 @@ from support.samples import moving, static
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import open_recording
 from tfbus.recording.formats import ros1
-from tfbus.recording.formats.ros1 import (
-    CHUNK,
-    Ros1Storage,
-    find_chunk,
-    read_chunk,
-    read_record,
-    split_chunk,
-)
+from tfbus.recording.formats.ros1 import CHUNK, Ros1Storage, find_chunk, read_chunk, read_record, split_chunk
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.formats.transforms import write_ros1
 from tfbus.tf_message import encode

@@ -29,7 +29,7 @@ _SUFFIXES = (".mcap", ".bag", ".db3", ".active")
 
 
 def check(
-    what: str,
+    what: str | None = None,
     /,
     *,
     since: Annotated[Instant | None, Parameter(name="--from")] = None,
@@ -52,7 +52,7 @@ def check(
     Parameters
     ----------
     what
-        A recording, or the name of a domain.
+        A recording, or the name of a domain; without it, the domain of --domain, or ROS with --ros.
     since
         For a recording, where to start: seconds from the beginning, a stamp in seconds, or a date.
     until
@@ -69,13 +69,16 @@ def check(
         Print a JSON list of findings instead.
     """
     limits = Limits(translation=max_translation, speed=max_speed, turn_rate=max_turn_rate)
-    file = Path(what)
-    if file.exists() or file.suffix in _SUFFIXES:
+    file = None if what is None else Path(what)
+    if file is not None and (file.exists() or file.suffix in _SUFFIXES):
         findings = _check_file(file, topics, limits, since, until)
     elif since is not None or until is not None:
-        raise UsageError(f"--from and --to are for recordings, and there is no file {what!r}")
+        missing = "none is given" if what is None else f"there is no file {what!r}"
+        raise UsageError(f"--from and --to are for recordings, and {missing}")
+    elif what is not None and link.ros:
+        raise UsageError(f"--ros joins ROS in place of a domain: leave {what!r} out")
     else:
-        findings = _check_domain(replace(link, domain=what), limits, duration)
+        findings = _check_domain(link if what is None else replace(link, domain=what), limits, duration)
     if as_json:
         print(json.dumps([{**asdict(finding), "advice": finding.advice} for finding in findings], indent=2))
     else:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from tfbus.cli.arguments import Flag, UsageError
-from tfbus.cli.output import track, write_file
+from tfbus.cli.output import say, track, write_file
 from tfbus.cli.recordings import load_tree, warn_of_losses
 from tfbus.errors import UnknownFrameError
 from tfbus.plain import printable
@@ -104,6 +104,7 @@ def _finish(draw: Callable[[Any], Any], output: Path | None, kind: str | None) -
         picture = BytesIO()
         draw(None).savefig(picture, format=kind, dpi=150)
         write_file(output, picture.getvalue())
+        say(f"wrote {output}")
         return
     from tfbus.plot import show_in_window
 

@@ -11,7 +11,7 @@ import anyio
 
 from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Flag, Rate, UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, publish_static, ros_link
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, publish_static
 from tfbus.cli.output import (
     Column,
     cells,
@@ -51,9 +51,10 @@ def robot(
     prefix: str = "",
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:
-    """Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at zero.
+    """Publish the frames of a robot until Ctrl-C, or print them as a tree.
 
-    Fixed joints are published once, the others again and again. If a frame is refused, because it conflicts with an
+    Joints without a position are at zero; with --follow, they are not published until ROS tells their positions. Fixed
+    joints are published once, the others again and again. If a frame is refused, because it conflicts with an
     edge of another program, it is tried again. A position beyond the limits of its joint is reported, but published.
 
     Example: tfbus robot arm.urdf shoulder=0.5 elbow=-1.2 --tree
@@ -121,7 +122,7 @@ async def _follow(bus: Bus, link: LinkOptions, model: RobotModel | None, prefix:
     async with AsyncExitStack() as stack:
         for place in link.ros:
             # This link carries the positions only; other links carry the frames.
-            positions_only = ros_link(bus, place, send=False, frames=(), joint_states=publisher.publish)
+            positions_only = link.ros_link(bus, place, send=False, frames=(), joint_states=publisher.publish)
             await stack.enter_async_context(positions_only)
         await anyio.sleep_forever()
 
@@ -138,7 +139,7 @@ async def _model_of_ros(bus: Bus, link: LinkOptions) -> RobotModel:
     say(f"waiting for /robot_description of {link.place}")
     async with AsyncExitStack() as stack:
         for place in link.ros:
-            description_only = ros_link(bus, place, send=False, frames=(), robot_description=take)
+            description_only = link.ros_link(bus, place, send=False, frames=(), robot_description=take)
             await stack.enter_async_context(description_only)
         await described.wait()
     # A text without a tag would be taken for a path.

@@ -47,7 +47,9 @@ def static(
     ----------
     parent
         The frame in which the numbers are expressed; or, without CHILD, a file of YAML or JSON: a list whose entries
-        have a parent, a child, xyz, and rpy, rpy_deg or quaternion.
+        have a parent, a child, xyz, and rpy, rpy_deg or quaternion, as `save_static` writes it. Entries with
+        translation and rotation are read too, as `tfbus convert --static-to-yaml` writes them, and those of
+        `TransformStamped.to_dict`.
     child
         The frame to place.
     xyz

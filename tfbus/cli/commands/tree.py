@@ -2,7 +2,7 @@
 
 import json
 import subprocess
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, ReplayClock
 from tfbus.cli.output import print_now, say, write_file
+from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions, load_tree
 from tfbus.cli.tree_display import TreeDisplay
 from tfbus.links.link import Link
 from tfbus.stamps import to_seconds
@@ -29,6 +30,8 @@ _NAMED = 5
 
 
 def tree(
+    file: Path | None = None,
+    /,
     *,
     duration: Duration | None = None,
     watch: Flag = False,
@@ -38,6 +41,7 @@ def tree(
     pdf: Path | None = None,
     png: Path | None = None,
     as_json: JsonFlag = False,
+    topics: TopicOptions = DEFAULT_TOPICS,
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:
     """Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.
@@ -46,8 +50,12 @@ def tree(
 
     Example: tfbus tree --svg frames.svg
 
+    Example: tfbus tree run.mcap --svg frames.svg
+
     Parameters
     ----------
+    file
+        A recording to show in place of a domain; ages are counted from its newest stamp.
     duration
         How many seconds to listen, from the first transform on; by default until every frame has been heard twice and
         all are connected, at least 1 and at most 5.
@@ -71,6 +79,26 @@ def tree(
     links: list[Link] = []
     pictures = {kind: path for kind, path in (("svg", svg), ("pdf", pdf), ("png", png)) if path is not None}
 
+    def write_pictures(edges: Sequence[Edge], now: int, delays: Mapping[str, float] | None = None) -> None:
+        if dot is not None:
+            write_file(dot, to_dot(edges).encode())
+        for kind, path in pictures.items():
+            draw(to_dot(edges, now, delays), kind, path)
+
+    if file is not None:
+        if watch or duration is not None:
+            raise UsageError("--watch and --duration are for a domain, not for a recording")
+        recorded, _ = load_tree(file, topics)
+        edges = recorded.edges()
+        now = max((edge.newest for edge in edges if edge.newest is not None), default=0)
+        write_pictures(edges, now)
+        if as_json:
+            print(json.dumps({"file": str(file), **to_document(recorded.frames(), edges, now)}, indent=2))
+        else:
+            with TreeDisplay(live=False) as display:
+                display.show(edges, now)
+        return
+
     async def show_tree(bus: Bus) -> None:
         delays = Delays()
         with (
@@ -81,13 +109,10 @@ def tree(
 
             async def show_once() -> None:
                 edges, now = buffer.tree.edges(), bus.clock.now()
-                if dot is not None:
-                    write_file(dot, to_dot(edges).encode())
-                for kind, path in pictures.items():
-                    graph = to_dot(edges, now, delays.by_frame)
-                    await anyio.to_thread.run_sync(draw, graph, kind, path)
+                if dot is not None or pictures:
+                    await anyio.to_thread.run_sync(write_pictures, edges, now, delays.by_frame)
                 if as_json:
-                    document = to_document(link.domain, buffer.tree.frames(), edges, now)
+                    document = {"domain": link.domain, **to_document(buffer.tree.frames(), edges, now)}
                     print_now(json.dumps(document, indent=None if watch else 2))
                 else:
                     display.show(edges, now)
@@ -135,11 +160,10 @@ def _names(frames: Sequence[str]) -> str:
     return named + (f" and {len(frames) - _NAMED:,} more" if len(frames) > _NAMED else "")
 
 
-def to_document(domain: str, frames: Iterable[str], edges: Iterable[Edge], now: int) -> dict[str, Any]:
-    """The JSON document of the tree; ages are counted from `now`, in ns."""
+def to_document(frames: Iterable[str], edges: Iterable[Edge], now: int) -> dict[str, Any]:
+    """The JSON document of the tree, without its place; ages are counted from `now`, in ns."""
     edge_above = {edge.child: edge for edge in edges}
     return {
-        "domain": domain,
         "stamp": now,
         "frames": {frame: _describe(edge_above.get(frame), now) for frame in frames},
     }

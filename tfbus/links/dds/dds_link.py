@@ -35,11 +35,22 @@ from cyclonedds.util import duration
 from tfbus._aio.loops import wait_for_all
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.dds.readers import PATIENCE, RETRY, Greeting, Publishers, ReaderThread, delete, is_of_ros, join, read
+from tfbus.links.dds.readers import (
+    PATIENCE,
+    RETRY,
+    Greeting,
+    Publishers,
+    ReaderThread,
+    delete,
+    is_of_ros,
+    join,
+    name_of,
+    read,
+)
 from tfbus.links.dds.types import RawClock, RawEntitiesInfo, RawJointState, RawString, RawTFMessage
 from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, as_domain, settings_of
-from tfbus.links.seams import Presence, Received
+from tfbus.links.seams import Joined, Left, Received
 from tfbus.tf_message import MalformedMessageError, encode
 
 Discovery = Literal["localhost", "subnet"]
@@ -329,6 +340,11 @@ class DdsCarrier(RosCarrier):
             return False
         return any(is_of_ros(each) for each in read(self._participants) if each.key.hex == participant)
 
+    def name_of(self, participant: str) -> str:
+        """The name of a participant, by its id; the id if it has none."""
+        known = () if self._participants is None else read(self._participants)
+        return next((name_of(each) for each in known if each.key.hex == participant), "") or participant
+
     def _take_nodes(self, reader: DataReader[RawEntitiesInfo]) -> bool:
         return self._take_each(reader, self._take_node)
 
@@ -365,9 +381,9 @@ class DdsCarrier(RosCarrier):
         present = frozenset().union(*self._matched.values())
         self._publishers.keep_only(set(present))
         for participant in sorted(present - self._present):
-            self._receive(Received(participant, Presence.JOINED))
+            self._receive(Received(participant, Joined()))
         for participant in sorted(self._present - present):
-            self._receive(Received(participant, Presence.LEFT))
+            self._receive(Received(participant, Left()))
         self._present = present
         greeting = self._greetings.get(number)
         return None if greeting is None else greeting.update(frozenset(each.key.hex for each in publications))
@@ -401,7 +417,8 @@ class DdsLink(RosLink):
         ``CYCLONEDDS_URI``.
     **options
         All links to ROS share them: see `tfbus.links.ros.RosLink`. By default, the authority of a sample is the
-        node that has published it, such as ``/robot_state_publisher``.
+        node that has published it, such as ``/robot_state_publisher``; for a program that is no node, the name of its
+        participant, such as ``tfbus static [4711]`` for a program with a link, or else the id of that.
 
     Attributes
     ----------
@@ -427,7 +444,14 @@ class DdsLink(RosLink):
     -----
     The qualities of service are those of tf2: all is reliable, ``/tf_static`` is transient local. A peer is a process
     with a broadcaster. Entering takes up to 1.6 s where there are ROS 2 programs, and then their frames come at once.
-    Every program that reaches the domain can publish there, and read everything.
+    Every program that reaches the domain can publish there, and read everything. The participant of the link is named
+    after the program, for tools of DDS such as ``cyclonedds ps``; it is no node, so ``ros2 node list`` lacks it.
+
+    Examples
+    --------
+    >>> async def show(bus: Bus, buffer: Buffer) -> None:
+    ...     async with DdsLink(bus, domain=42):
+    ...         print(await buffer.lookup("map", "base_link", timeout=5.0))
     """
 
     def __init__(

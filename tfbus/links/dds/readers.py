@@ -14,10 +14,13 @@ later wait for each other for ever.
 ROS 2 tells on a topic of its own which node has which writer. `Publishers` holds messages until it has done so.
 """
 
+import os
+import sys
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from math import inf
+from pathlib import Path
 from threading import Lock, Thread
 from time import monotonic, sleep
 from typing import Any, Protocol
@@ -26,7 +29,7 @@ from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant, B
 from cyclonedds.core import DDSStatus, Entity, GuardCondition, WaitSet
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
-from cyclonedds.qos import Policy
+from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.util import duration
 
@@ -40,6 +43,7 @@ GREETING_TIME = 0.5
 """s; for so long there is a second reader, which new writers greet."""
 _PERIOD = 0.002
 _MOST = 10_000
+_LONGEST_NAME = 256
 _OF_ROS = b"enclave="
 _CYCLONE = "0110"
 """The ids of writers of Cyclone DDS begin so; it greets until it is understood."""
@@ -54,10 +58,12 @@ def join(number: int, stack: ExitStack) -> DomainParticipant:
         If the domain cannot be joined.
     """
     # The library talks of endpoints through the first participant of a process, so this one stays.
-    first = DomainParticipant(number)
+    # Tools of DDS show it, and links to the same domain, for which it is the authority of what comes from here.
+    named = Qos(Policy.EntityName(f"tfbus {Path(sys.argv[0]).name or 'python'} [{os.getpid()}]"))
+    first = DomainParticipant(number, named)
     stack.callback(delete, first)
     programs = _answering(first)
-    participant = DomainParticipant(number)
+    participant = DomainParticipant(number, named)
     stack.callback(delete, participant)
     writers = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
     _wait(lambda: programs <= {each.participant_key.hex for each in read(writers)}, WRITERS_TIME)
@@ -73,6 +79,12 @@ def read(reader: BuiltinDataReader) -> list[Any]:
         # A stranger has called a participant so. The library reads all of them or none.
         return []
     return [each for each in found if not isinstance(each, InvalidSample)]
+
+
+def name_of(participant: Any) -> str:
+    """The name of a participant, as the library tells of it; empty if it has none."""
+    name: str = participant.qos[Policy.EntityName].name if Policy.EntityName in participant.qos else ""
+    return name[:_LONGEST_NAME]
 
 
 def is_of_ros(participant: Any) -> bool:
@@ -274,7 +286,10 @@ class Hearer(Protocol):
     """Takes messages with their names, and knows the participants."""
 
     def deliver(self, participant: str, authority: str, payload: bytes, static: bool) -> object:
-        """Take a message, with the name of its node, or the id of its participant if it has none."""
+        """Take a message, with the name of its node, or else that of its participant."""
+
+    def name_of(self, participant: str) -> str:
+        """The name of a participant, by its id; the id if it has none."""
 
     def is_of_ros(self, participant: str) -> bool:
         """Whether a participant, by its id, is known to be of ROS 2, and so will tell the names of its nodes."""
@@ -361,7 +376,7 @@ class Publishers:
                 self._flush(self._publishers.pop(publisher))
 
     def _flush(self, publisher: _Publisher) -> None:
-        publisher.name = publisher.name or publisher.participant
+        publisher.name = publisher.name or self._hearer.name_of(publisher.participant)
         waiting, publisher.waiting = publisher.waiting, []
         self._bytes -= sum(len(payload) for payload, _ in waiting)
         for payload, static in waiting:

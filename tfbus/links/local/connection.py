@@ -154,7 +154,7 @@ class Connection:
         self.waits = waits
         self._reads = True
         # The rest of a frame whose writing has begun: nothing goes before it.
-        self._rest = memoryview(b"")
+        self._rest: memoryview | None = None
         self._sent: deque[bytes] = deque()
         self._published: deque[bytes] = deque()
         self._size_sent = self._size_published = 0
@@ -195,7 +195,7 @@ class Connection:
         """Whether a part of the frame is written; then the rest goes before all others."""
         written = self._write(frame)
         if written < len(frame):
-            self._rest = memoryview(frame)[written:] if written else self._rest
+            self._rest = memoryview(frame)[written:] if written else None
             self.waits = True
             self._watch()
         return written > 0
@@ -205,19 +205,19 @@ class Connection:
         most = MOST_AT_ONCE
         while most > 0:
             queue = self._sent or self._published
-            if not self._rest and not queue:
+            if self._rest is None and not queue:
                 self.waits = False
                 self._watch()
                 return
-            frame = self._rest or memoryview(queue[0])
+            frame = memoryview(queue[0]) if self._rest is None else self._rest
             written = self._write(frame)
             if not written:
                 return
-            if not self._rest:
+            if self._rest is None:
                 self._size_sent -= len(frame) * (queue is self._sent)
                 self._size_published -= len(frame) * (queue is self._published)
                 queue.popleft()
-            self._rest = frame[written:]
+            self._rest = frame[written:] if written < len(frame) else None
             most -= written
 
     def stop_reading(self) -> None:
@@ -249,11 +249,12 @@ class Connection:
                 break
             start, at = at + 4, at + 4 + length
             yield bytes(memoryview(data)[start:at])
-        if data is chunk:
-            self.tail += chunk[at:]
-        else:
+        if data is not chunk:
             del self.tail[:at]
-        self.grown = monotonic()
+        elif at < end:
+            self.tail += chunk[at:]
+        if self.tail:
+            self.grown = monotonic()
 
     # Meeting
 

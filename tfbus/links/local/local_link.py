@@ -42,6 +42,21 @@ class LocalLink(DomainLink):
     -----
     A peer is lost when its process or its link has ended, which the kernel tells at once. A process that is busy or
     stopped is not lost; its frames grow old.
+
+    At Ctrl-C the event loop ends the ``async with`` in order, and then Python shows some 50 lines of traceback, unless
+    the program says that this is its end. The star counts on trio, which raises a group of exceptions::
+
+        try:
+            asyncio.run(main())  # or anyio.run(main), or trio.run(main)
+        except* KeyboardInterrupt:
+            pass
+
+    Examples
+    --------
+    >>> async def main() -> None:
+    ...     with Bus() as bus, Buffer(bus) as buffer:
+    ...         async with LocalLink(bus):
+    ...             print(await buffer.lookup("map", "base_link"))
     """
 
     def __init__(

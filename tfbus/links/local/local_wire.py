@@ -107,9 +107,10 @@ class LocalWire(Wire):
             domain, self.id, directory, not hasattr(socket, "AF_UNIX") if loopback is None else loopback
         )
         self._listener: socket.socket | None = None
-        # All of them, the oldest first; and those that are met, by the ids of the other links.
+        # All of them, the oldest first; and those that are met, by the ids of the other links and by their channels.
         self._connections: dict[Connection, None] = {}
         self._links: dict[str, Connection] = {}
+        self._hearers: dict[str, list[Connection]] = {}
         # The time before which a name is not dialled (s).
         self._due: dict[str, float] = {}
 
@@ -128,13 +129,13 @@ class LocalWire(Wire):
             tasks.start_soon(self._meet)
 
     def is_heard(self, channel: str) -> bool:
-        return any(connection.hears == channel for connection in self._links.values())
+        return bool(self._hearers.get(channel))
 
     def is_behind(self) -> bool:
         return any(readable for _, readable, _ in self._poll.ready())
 
     def publish(self, channel: str, message: bytes) -> None:
-        hearers = [connection for connection in self._links.values() if connection.hears == channel]
+        hearers = self._hearers.get(channel)
         if hearers and len(message) <= MAX_MESSAGE:
             frame = frame_of(message)
             for connection in hearers:
@@ -166,6 +167,7 @@ class LocalWire(Wire):
             connection.close()
         self._connections.clear()
         self._links.clear()
+        self._hearers.clear()
         self._buffer = memoryview(b"")
 
     # Listening and dialling
@@ -330,6 +332,8 @@ class LocalWire(Wire):
         del self._connections[connection]
         if connection.met:
             del self._links[connection.link]
+            if connection.hears is not None:
+                self._hearers[connection.hears].remove(connection)
             if connection.heard is not None:
                 self._receive(connection.link, Left())
 
@@ -351,6 +355,8 @@ class LocalWire(Wire):
         else:
             connection.take_welcome(content)
             self._links[connection.link] = connection
+            if connection.hears is not None:
+                self._hearers.setdefault(connection.hears, []).append(connection)
             if connection.heard is not None:
                 self._receive(connection.link, Joined(connection.robot))
 

@@ -57,7 +57,7 @@ from tfbus.links.rosbridge.protocol import (
     unsubscribe,
 )
 from tfbus.links.rosbridge.websocket import WebSocket, check_url
-from tfbus.links.seams import Presence, Received, SendReport
+from tfbus.links.seams import Joined, Left, Received, SendReport
 from tfbus.tf_message import Decoded, MalformedMessageError
 
 CONFIRM_TIME, LONGEST_CONFIRM_TIME = 2.0, 30.0
@@ -211,7 +211,7 @@ class RosbridgeCarrier(RosCarrier):
         if self.settings.send:
             self._request(advertise(self.settings.tf_static[0], static=True))
             self.publish_statics()
-        self._receive(Received(self.url, Presence.JOINED))
+        self._receive(Received(self.url, Joined()))
 
     async def run(self) -> None:
         """Talk with the server, and connect again whenever it has gone."""
@@ -292,7 +292,7 @@ class RosbridgeCarrier(RosCarrier):
         # Not when the link ends: then there is still something to send.
         self._socket = None
         self._broken_at = anyio.current_time()
-        self._receive(Received(self.url, Presence.LEFT))
+        self._receive(Received(self.url, Left()))
         await socket.close()
 
     async def _until_gone(self, work: Callable[[WebSocket], Any], socket: WebSocket, scope: anyio.CancelScope) -> None:

@@ -19,15 +19,12 @@ is not taken back at its other end, because the first router finds no connection
 it on yet. So a link that ended at this moment stays present there, until its router is not reached on any way.
 """
 
-import json
 import os
 import threading
 from random import uniform
 from typing import Any, Final
 
 import zenoh
-
-from tfbus.links.zenoh.sessions import open_session
 
 PATIENCE: Final = 2.0, 5.0
 """s; so long a router may be connected without its token; drawn at random, so that not both begin anew at once."""
@@ -43,17 +40,21 @@ _MARK: Final = b"tfbus".hex()
 _TOKENS: Final = "tfbus/@router/"
 
 
-def open_router(config: zenoh.Config) -> zenoh.Session:
-    """Open the session of a router; raises as `open_session`."""
-    config.insert_json5("id", json.dumps(_MARK + os.urandom(11).hex()))
-    return open_session(config)
+def new_id() -> str:
+    """An id for a session of a router of tfbus."""
+    return _MARK + os.urandom(11).hex()
 
 
 class Neighbours:
-    """The other routers of tfbus that the session of a router is connected to."""
+    """The other routers of tfbus that the session of a router is connected to.
+
+    Attributes
+    ----------
+    declared : list
+        To be kept until the session ends.
+    """
 
     def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
         self._info = session.info
         self._patience = uniform(*PATIENCE)
         self._lock = threading.Lock()
@@ -62,7 +63,7 @@ class Neighbours:
         self._silent: dict[str, float] = {}
         take = zenoh.handlers.Callback(self._take, indirect=False)
         liveliness = session.liveliness()
-        self._declared: list[Any] = [
+        self.declared: list[Any] = [
             liveliness.declare_subscriber(f"{_TOKENS}*", take, history=True),
             liveliness.declare_token(f"{_TOKENS}{self._info.zid()}"),
         ]
@@ -74,14 +75,6 @@ class Neighbours:
             missing = connected - self._heard
         self._silent = {router: self._silent.get(router, now) for router in missing}
         return any(now - since >= self._patience for since in self._silent.values())
-
-    def close(self) -> None:
-        """Close the session; blocks."""
-        try:
-            self._session.close()
-        finally:
-            # The garbage collector does not see through zenoh's objects.
-            self._declared.clear()
 
     def _take(self, sample: zenoh.Sample) -> None:
         router = str(sample.key_expr)[len(_TOKENS) :]

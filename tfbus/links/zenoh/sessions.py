@@ -14,7 +14,6 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from time import monotonic
 from typing import Any, Final, Protocol
 
 import zenoh
@@ -148,14 +147,8 @@ def _check_settings(paths: Iterable[str]) -> None:
             raise ValueError(f"zenoh's setting {path!r} is not for config: give addresses by connect and listen")
 
 
-def open_client(config: zenoh.Config, address: str) -> zenoh.Session:
-    """Open a session with one of the routers of `client_config`; raises as `open_session`."""
-    config.insert_json5("connect/endpoints", json.dumps([address]))
-    return open_session(config)
-
-
-def open_session(config: zenoh.Config) -> zenoh.Session:
-    """Open a session; blocks.
+def open_session(config: zenoh.Config, settings: Mapping[str, object] | None = None) -> zenoh.Session:
+    """Open a session with some more settings; blocks.
 
     Raises
     ------
@@ -166,6 +159,8 @@ def open_session(config: zenoh.Config) -> zenoh.Session:
     """
     use_zenoh()
     try:
+        for path, value in (settings or {}).items():
+            config.insert_json5(path, json.dumps(value))
         return zenoh.open(config)
     except BaseException as error:  # It panics at some addresses, such as tcp/host:7447?rel=3.
         raise os_error(error, "zenoh cannot open a session") from error
@@ -252,7 +247,7 @@ async def wait_until_closed(closing: Sequence[threading.Thread]) -> TimeoutError
 
 
 class Keeper:
-    """The thread in which a wire or a router opens and closes its sessions, because zenoh's calls block.
+    """The thread in which a wire opens and closes its sessions, because zenoh's calls block.
 
     A program that exits without the end of its links has them closed all the same.
 
@@ -279,16 +274,10 @@ class Keeper:
         atexit.register(self.stop)
         self._thread.start()
 
-    def wait(self, seconds: float | None = None) -> None:
+    def wait(self, seconds: float) -> None:
         """Wait for the next change, for so long at most; for the thread."""
         self.changed.wait(seconds)
         self.changed.clear()
-
-    def rest(self, seconds: float) -> None:
-        """Wait for so long, whatever changes, unless the thread is to end; for the thread."""
-        end = monotonic() + seconds
-        while not self.stopped and (left := end - monotonic()) > 0:
-            self.wait(left)
 
     def stop(self) -> None:
         """Have the thread end; from any thread."""

@@ -39,7 +39,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from random import uniform
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any, Final
 
 import anyio
@@ -47,8 +47,9 @@ import zenoh
 
 from tfbus._aio.loops import LoopWaker
 from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
-from tfbus.links.zenoh.neighbours import PAUSE_TO_BEGIN, PAUSE_TO_LISTEN, PERIOD, Neighbours, open_router
+from tfbus.links.zenoh.neighbours import PAUSE_TO_BEGIN, PAUSE_TO_LISTEN, PERIOD, Neighbours, new_id
 from tfbus.links.zenoh.sessions import (
+    CLOSING_TIME,
     LONGEST_NAME,
     Addresses,
     Keeper,
@@ -57,7 +58,7 @@ from tfbus.links.zenoh.sessions import (
     client_config,
     close_session,
     endpoints,
-    open_client,
+    open_session,
     os_error,
     router_config,
 )
@@ -137,7 +138,6 @@ class ZenohWire(Wire):
             )
         self._session: _Session | None = None
         self._number = 0
-        self._has_listened = False
         self._keeper = Keeper(self._keep)
         self._failure: OSError | None = None
 
@@ -204,8 +204,8 @@ class ZenohWire(Wire):
         channels: list[str] = []
         while (session := self._connect(channels)) is not None:
             self._wake()
-            while not (self._keeper.stopped or session.is_broken(now := monotonic())):
-                self._keeper.wait(session.let_leave(now))
+            while not self._keeper.stopped and (pause := session.look(monotonic())) is not None:
+                self._keeper.wait(pause)
             self._session = None
             channels = session.channels
             if self._keeper.stopped:
@@ -214,42 +214,40 @@ class ZenohWire(Wire):
             session.hearer.end()
             begin_to_close(session)
             if self._is_router:
-                self._keeper.rest(PAUSE_TO_BEGIN)
+                sleep(PAUSE_TO_BEGIN)
             self._addresses.rotate(-1)
 
     def _connect(self, channels: Iterable[str]) -> "_Session | None":
         """Try one router after the other until one answers; None if the wire is closed, or cannot listen."""
-        since: float | None = monotonic()
-        while True:
-            for _ in range(max(1, len(self._addresses))):
-                if self._keeper.stopped:
-                    return None
-                try:
-                    return self._connect_once(channels)
-                except OSError as error:
-                    failure = error
-                self._addresses.rotate(-1)
+        warns_at = monotonic() + FIRST_WAIT
+        while not self._keeper.stopped:
+            try:
+                return self._connect_once(channels)
+            except OSError as error:
+                failure = error
+            self._addresses.rotate(-1)
             if self._is_router:
+                if self._number == 1:
+                    self._failure = failure
+                    self._wake()
+                    return None
                 # The session before may not have freed the address yet.
-                if self._has_listened:
-                    self._keeper.wait(PAUSE_TO_LISTEN)
-                    continue
-                self._failure = failure
-            elif since is not None and monotonic() > since + FIRST_WAIT:
-                since = None
+                self._keeper.wait(PAUSE_TO_LISTEN)
+                continue
+            if monotonic() > warns_at:
+                warns_at = math.inf
                 where = ", ".join(sorted(self._addresses))
                 # zenoh's usual error names the addresses once more, and no reason.
                 why = "" if "Unable to connect to any of" in str(failure) else f": {failure}"
                 self._failure = OSError(f"no router answers at {where}, and the link goes on trying{why}")
-            self._wake()
-            if self._is_router:
-                return None
-            self._keeper.wait(uniform(*PAUSE))
+                self._wake()
+            self._keeper.wait(uniform(*PAUSE) / len(self._addresses))
+        return None
 
     def _connect_once(self, channels: Iterable[str]) -> "_Session":
         self._number += 1
-        raw = open_router(self._config) if self._is_router else open_client(self._config, self._addresses[0])
-        self._has_listened = self._is_router
+        own = {"id": new_id()} if self._is_router else {"connect/endpoints": [self._addresses[0]]}
+        raw = open_session(self._config, own)
         hearer = _Hearer(self.id, self._domain, self._hears, self._receive, self._keeper.changed)
         session = _Session(raw, hearer, self._own, self.id)
         try:
@@ -261,7 +259,8 @@ class ZenohWire(Wire):
         except zenoh.ZError as error:
             self._session = None
             hearer.end()
-            begin_to_close(session)
+            # zenoh may not end it, if a client asks for tokens at this moment.
+            begin_to_close(session).join(CLOSING_TIME)
             raise os_error(error, "the session with a router broke at once") from error
         return session
 
@@ -290,22 +289,18 @@ class _Session:
     def channels(self) -> list[str]:
         return list(self._publishers)
 
-    def is_broken(self, now: float) -> bool:
-        """Whether another session is needed."""
-        return self.hearer.broken or (self._neighbours is not None and self._neighbours.are_silent(now))
-
-    def let_leave(self, now: float) -> float | None:
-        """Tell of links that have left; returns the s until the next look at the session, None if a change is first."""
-        left = self.hearer.let_leave(now)
-        if self._neighbours is None:
-            return left
-        return PERIOD if left is None else min(left, PERIOD)
+    def look(self, now: float) -> float | None:
+        """Tell of links that have left; returns the s until the next look, or None if another session is needed."""
+        if self.hearer.broken or (self._neighbours is not None and self._neighbours.are_silent(now)):
+            return None
+        return self.hearer.let_leave(now)
 
     def begin(self, domain: str, number: int, hears: Sequence[Hearing], *, is_router: bool) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
         session, hearer, declared = self._session, self.hearer, self._declared
         if is_router:
             self._neighbours = Neighbours(session)
+            declared += self._neighbours.declared
         else:
             declared.append(session.info.declare_transport_events_listener(_directly(hearer.take_event)))
         for index, (robots, channel) in enumerate(hears):
@@ -364,11 +359,12 @@ class _Session:
                 with suppress(zenoh.ZError):
                     publisher.undeclare()
         try:
-            (self._neighbours or self._session).close()
+            self._session.close()
         finally:
             # The garbage collector does not see through zenoh's objects.
             self._declared.clear()
             self._publishers.clear()
+            self._neighbours = None
 
 
 class _Hearer:
@@ -434,12 +430,12 @@ class _Hearer:
                 self._present[link] = number, index
                 self._receive(link, Joined(robot))
 
-    def let_leave(self, now: float) -> float | None:
-        """Tell of the links that have left by now; returns the s until the next one has, None if no link is leaving."""
+    def let_leave(self, now: float) -> float:
+        """Tell of the links that have left by now; returns the s until the next look."""
         with self._lock:
             for link in [link for link, due in self._leaving.items() if due <= now]:
                 self._leave(link)
-            return min(self._leaving.values()) - now if self._leaving else None
+            return min([PERIOD, *(due - now for due in self._leaving.values())])
 
     def take_event(self, event: zenoh.TransportEvent) -> None:
         if event.kind == zenoh.SampleKind.DELETE:

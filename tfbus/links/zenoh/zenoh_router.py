@@ -1,25 +1,10 @@
 """A zenoh router in this process, which links and other routers connect to."""
 
-import threading
-from time import monotonic
 from types import TracebackType
 from typing import Final, Self
 
-import anyio
-import anyio.to_thread
-import zenoh
-
-from tfbus.links.zenoh.neighbours import PAUSE_TO_BEGIN, PAUSE_TO_LISTEN, PERIOD, Neighbours, open_router
-from tfbus.links.zenoh.sessions import (
-    CLOSING_TIME,
-    Addresses,
-    Keeper,
-    Settings,
-    begin_to_close,
-    close_session,
-    os_error,
-    router_config,
-)
+from tfbus.links.zenoh.sessions import Addresses, Settings
+from tfbus.links.zenoh.wire import ZenohWire
 from tfbus.registration import AsyncOnly, warn_unless_entered
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
@@ -65,11 +50,9 @@ class ZenohRouter(AsyncOnly):
         config: Settings | None = None,
         lease: float | None = None,
     ) -> None:
-        self._config = router_config(listen, connect or (), config, lease)
-        self._keeper = Keeper(self._keep)
+        # A link of no bus, which hears nobody.
+        self._wire = ZenohWire("@router", listen=listen, connect=connect, config=config, lease=lease)
         self._entered = False
-        self._opened = threading.Event()
-        self._failure: OSError | None = None
         self._never_entered = warn_unless_entered(self)
 
     async def __aenter__(self) -> Self:
@@ -77,49 +60,14 @@ class ZenohRouter(AsyncOnly):
             raise RuntimeError("a router is entered once: make another one")
         self._entered = True
         self._never_entered.detach()
-        self._keeper.start()
         try:
-            await anyio.to_thread.run_sync(self._opened.wait, abandon_on_cancel=True)
-            if self._failure is not None:
-                raise self._failure
+            await self._wire.open((), lambda *_: None, lambda _: None)
         except BaseException:
-            await self._keeper.end()
+            await self._wire.close()
             raise
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        await self._keeper.end()
-
-    def _open(self) -> Neighbours:
-        session = open_router(self._config)
-        try:
-            return Neighbours(session)
-        except zenoh.ZError as error:
-            # zenoh may not end it, if a client asks for tokens at this moment.
-            begin_to_close(session).join(CLOSING_TIME)
-            raise os_error(error, "the session of a router broke at once") from error
-
-    def _keep(self) -> None:
-        """Have one session after another, until the router is closed; the first one has to open."""
-        keeper = self._keeper
-        while not (self._opened.is_set() and keeper.stopped):
-            try:
-                router = self._open()
-            except OSError as error:
-                if not self._opened.is_set():
-                    self._failure = error
-                    return
-                # The session before may not have freed the address yet.
-                keeper.wait(PAUSE_TO_LISTEN)
-                continue
-            finally:
-                self._opened.set()
-            while not (keeper.stopped or router.are_silent(monotonic())):
-                keeper.wait(PERIOD)
-            if keeper.stopped:
-                close_session(router)
-            else:
-                begin_to_close(router)
-                keeper.rest(PAUSE_TO_BEGIN)
+        await self._wire.close()
