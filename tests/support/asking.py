@@ -93,7 +93,12 @@ def threads_that(read: Callable[[], None], number: int = 2) -> Iterator[None]:
     try:
         with ThreadPoolExecutor(number) as pool:
             readers = [pool.submit(go_on) for _ in range(number)]
-            begun.wait()
+            try:
+                begun.wait()
+            except BaseException:
+                # A reader that waits for others would hold up the end of the pool.
+                begun.abort()
+                raise
             try:
                 yield
             finally:
