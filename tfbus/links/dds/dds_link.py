@@ -418,7 +418,7 @@ class DdsLink(RosLink):
     **options
         All links to ROS share them: see `tfbus.links.ros.RosLink`. By default, the authority of a sample is the
         node that has published it, such as ``/robot_state_publisher``; for a program that is no node, the name of its
-        participant, such as ``tfbus static [4711]`` for a program with a link, or else the id of that.
+        participant, such as ``tfbus robot.py [4711]`` for a program with a link, or else the id of that.
 
     Attributes
     ----------
