@@ -28,7 +28,7 @@ except* KeyboardInterrupt:
 
 @pytest.mark.parametrize("loop", ["asyncio.run", pytest.param("asyncio", marks=pytest.mark.thorough), "trio"])
 def test_a_program_ends_at_ctrl_c_in_order_and_without_a_traceback(loop: str) -> None:
-    with Program(sys.executable, "-c", PROGRAM, loop, new_domain()) as program:
+    with Program(sys.executable, "-P", "-c", PROGRAM, loop, new_domain()) as program:
         program.output.expect("on")
         assert program.end() == 0
         assert program.output.text.endswith("left\n")
