@@ -473,12 +473,19 @@ CLAIMS: list[Happening] = [
 ]
 # A frame that is heard again in time does not turn stale, and then does.
 HEARD = [*[Burst((), [("publish", [STRANGERS], True)], 0.5)] * 3, Burst((), [], 4.0)]
+# A frame that has become static, then one that has always been: after a jump back, a new reader hears of both in order.
+FIXED: list[Happening] = [
+    ("publish", [Draft(edge, 0, "odometry", static, False)], True)
+    for edge, static in ((("a", "b"), False), (("r", "a"), True), (("a", "b"), True))
+]
+REJOINED = [Burst((), [*FIXED, ("jump", -1), ("join", 5, None)], 0.5)] * 2
 QUARREL = [Burst((), CLAIMS * 3, 0.5), Burst((), [("remove", "b"), *CLAIMS, ("jump", -1), *CLAIMS * 2], 4.0)]
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @example(on_conflict="last", bursts=QUARREL)
 @example(on_conflict="last", bursts=HEARD)
+@example(on_conflict="last", bursts=REJOINED)
 @example(on_conflict="reject", bursts=QUARREL)
 @given(on_conflict=st.sampled_from(["last", "reject"]), bursts=st.lists(BURSTS, min_size=2, max_size=10))
 def test_every_reader_reads_exactly_what_the_model_says(run: Run, on_conflict: OnConflict, bursts: list[Burst]) -> None:

@@ -371,7 +371,7 @@ class Topology:
     def clear_moving(self) -> None:
         """Forget every moving child, but keep the right of its first authority."""
         self._ownership.remember(self._newest)
-        static = {child: self._newest[child] for child in self.latched.samples}
+        static = {child: known for child, known in self._newest.items() if known.static}
         self._newest.clear()
         self._newest.update(static)
         self.names = self.latched.names.copy()
