@@ -17,7 +17,7 @@ ERROR = (
     'Received an exception trying to transform a point from "base_laser" to "base_link": '
     "no transform from 'base_laser' to 'base_link' within 0.5 s: "
 )
-LATE = rf"^\[ERROR\] \d+\.\d{{9}}: {ERROR}frame 'base_laser': asked for .* newest sample is .*'robot_tf_publisher'$"
+LATE = rf"^\[ERROR\] \d+\.\d{{9}}: {ERROR}frame 'base_laser': newest sample is .* old, .*'robot_tf_publisher'$"
 INFO = (
     r"^\[ INFO\] \d+\.\d{9}: base_laser: \(1\.00, 0\.20\. 0\.00\) -----> base_link: \(1\.10, 0\.20, 0\.20\) "
     r"at time \d+\.\d\d$"
