@@ -46,6 +46,7 @@ def test_moving_samples_are_refused_by_name_and_nothing_is_written(tmp_path: Pat
         (samples, "'base', 'arm'"),
         (tree, "'base'"),
         ([moving("a", f"{i}", 1) for i in range(12)], "2 more"),
+        ([moving("a", "b", i) for i in range(12)], "these move: 'b'"),
     ):
         with pytest.raises(ValueError, match="only static transforms are saved, but these move: ") as caught:
             save_static(file, source)

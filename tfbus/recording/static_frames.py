@@ -92,8 +92,9 @@ def _static_samples(source: HasTree | TransformTree | Iterable[TransformStamped]
     else:
         raise TypeError(f"expected a buffer, a tree or samples, not {source!r}")
     if moving:
-        named = ", ".join(map(repr, dict.fromkeys(moving[:_NAMED])))
-        more = f" and {len(moving) - _NAMED} more" if len(moving) > _NAMED else ""
+        frames = list(dict.fromkeys(moving))
+        named = ", ".join(map(repr, frames[:_NAMED]))
+        more = f" and {len(frames) - _NAMED} more" if len(frames) > _NAMED else ""
         raise ValueError(f"only static transforms are saved, but these move: {named}{more}")
     return samples
 
