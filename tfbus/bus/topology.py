@@ -5,7 +5,7 @@ of a bad edge at once.
 """
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from copy import copy
@@ -291,14 +291,15 @@ class Topology:
         edges = self._newest.items()
         return {child: (known.parent, newest) for child, known in edges if (newest := known.newest) is not None}
 
-    def known(self) -> deque[tuple[int, str, str, str, bool]]:
+    def known(self) -> Iterator[tuple[int, str, str, str, bool]]:
         """The fields of a `FrameAdded` for each child that has a parent, as if it were new.
 
-        Made without a step in Python for each, because a stream that opens asks for all of them in one turn.
+        Made without a step in Python for each, because a stream that opens asks for all of them in one turn. Read
+        it before the next change.
         """
         edges = self._newest.values()
         fields = (map(attrgetter(name), edges) for name in ("parent", "authority", "static"))
-        return deque(zip(repeat(self._announcer.now()), self._newest, *fields, strict=False))
+        return zip(repeat(self._announcer.now()), self._newest, *fields, strict=False)
 
     def known_ahead(self) -> list[StampAhead]:
         """An event for each child whose newest sample is ahead of the clock."""

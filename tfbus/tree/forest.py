@@ -673,7 +673,7 @@ class Forest:
         parent, child, stamp, row, authority, static = sample._fields
         history = self.frames.get(child)
         if history is None:
-            history = self._add_frame(sample)
+            history = self._add_frame(child, parent, static)
             if child in self.changed:
                 self._suspects.append(sample)
         elif history.shared:
@@ -941,11 +941,9 @@ class Forest:
 
     # Bookkeeping
 
-    def _add_frame(self, sample: TransformStamped) -> FrameHistory:
-        parent, child, _, _, _, static = sample._fields
+    def _add_frame(self, child: str, parent: str, static: bool) -> FrameHistory:
         has_children = child in self.names
-        history = FrameHistory(child, parent, static, self.window)
-        self.frames[child] = history
+        history = self.frames[child] = FrameHistory(child, parent, static, self.window)
         self.names.update(child, history.named_parents)
         self.new_parents.add(parent)
         if has_children:

@@ -8,6 +8,7 @@ from typing import Any
 
 import anyio.to_thread
 
+from tfbus.analysis.arrivals import Delays
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError
@@ -75,9 +76,6 @@ def tree(
         Print a JSON document instead, with --watch one a line: for each frame its parent, kind, rate (Hz), age (s),
         span (s) and authority; null for a value that the frame does not have.
     """
-    # It loads the whole room, of which the help needs nothing.
-    from tfbus.analysis.arrivals import Delays
-
     links: list[Link] = []
     pictures = {kind: path for kind, path in (("svg", svg), ("pdf", pdf), ("png", png)) if path is not None}
 
