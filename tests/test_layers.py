@@ -33,7 +33,9 @@ GROUND = (
 ROOMS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(GROUND, ()),
     "geometry": (),
+    "axes": ("geometry",),
     "data": ("geometry",),
+    "earth": ("data",),
     "tf_message": ("geometry",),
     "tree": ("data",),
     "waiting": ("tree",),
@@ -47,12 +49,13 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "view": ("buffer", "recording", "robot"),
     "plot": ("recording",),
     "testing": ("geometry",),
-    "__init__": ("links", "message_filter", "recording", "testing"),
+    "__init__": ("axes", "earth", "links", "message_filter", "recording", "testing"),
     "cli": ("__init__", "links", "plot", "view"),
     "__main__": ("cli",),
 }
 
-SANS_IO = {*GROUND, "analysis", "geometry", "data", "tf_message", "tree", "waiting"} - {"clock", "_aio"}
+_PLAIN_ROOMS = {"analysis", "axes", "data", "earth", "geometry", "tf_message", "tree", "waiting"}
+SANS_IO = {*GROUND, *_PLAIN_ROOMS} - {"clock", "_aio"}
 EFFECTS = {"anyio", "asyncio", "sniffio", "socket", "threading", "time", "trio"}
 # The judge of a bus notices by itself that its comparison with the clock has grown old.
 ALLOWED_EFFECTS = {"tree.forest": {"threading"}, "_python_kernel": {"time"}}

@@ -16,16 +16,25 @@ _NAMES_IN = {
     "bus.queues": ("Stream",),
     "clock": ("Clock", "SimulatedClock", "SystemClock", "Ticks"),
     "data": (
+        "AccelStamped",
+        "Imu",
+        "InertiaStamped",
         "LaserScan",
+        "NavSatFix",
+        "Odometry",
+        "Path",
         "PointCloud",
         "PointStamped",
         "Polygon",
+        "PoseArray",
         "PoseStamped",
         "PoseWithCovarianceStamped",
         "QuaternionStamped",
         "Stamped",
         "TwistStamped",
+        "TwistWithCovarianceStamped",
         "Vector3Stamped",
+        "VelocityStamped",
         "WrenchStamped",
         "do_transform",
     ),
@@ -99,7 +108,7 @@ _NAMES_IN = {
 """The public names by module. `__init__.pyi` has the same as imports, for type checkers."""
 
 _HOMES = {name: module for module, names in _NAMES_IN.items() for name in names}
-_ROOMS = ("analysis", "data", "recording", "robot", "testing")
+_ROOMS = ("analysis", "axes", "data", "earth", "recording", "robot", "testing")
 
 __all__ = sorted(_HOMES)
 

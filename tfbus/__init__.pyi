@@ -1,7 +1,9 @@
 """The public names for type checkers; at run time `__init__.py` loads each when it is used first."""
 
 from tfbus import analysis as analysis
+from tfbus import axes as axes
 from tfbus import data as data
+from tfbus import earth as earth
 from tfbus import recording as recording
 from tfbus import robot as robot
 from tfbus import testing as testing
@@ -18,16 +20,25 @@ from tfbus.clock import Clock as Clock
 from tfbus.clock import SimulatedClock as SimulatedClock
 from tfbus.clock import SystemClock as SystemClock
 from tfbus.clock import Ticks as Ticks
+from tfbus.data import AccelStamped as AccelStamped
+from tfbus.data import Imu as Imu
+from tfbus.data import InertiaStamped as InertiaStamped
 from tfbus.data import LaserScan as LaserScan
+from tfbus.data import NavSatFix as NavSatFix
+from tfbus.data import Odometry as Odometry
+from tfbus.data import Path as Path
 from tfbus.data import PointCloud as PointCloud
 from tfbus.data import PointStamped as PointStamped
 from tfbus.data import Polygon as Polygon
+from tfbus.data import PoseArray as PoseArray
 from tfbus.data import PoseStamped as PoseStamped
 from tfbus.data import PoseWithCovarianceStamped as PoseWithCovarianceStamped
 from tfbus.data import QuaternionStamped as QuaternionStamped
 from tfbus.data import Stamped as Stamped
 from tfbus.data import TwistStamped as TwistStamped
+from tfbus.data import TwistWithCovarianceStamped as TwistWithCovarianceStamped
 from tfbus.data import Vector3Stamped as Vector3Stamped
+from tfbus.data import VelocityStamped as VelocityStamped
 from tfbus.data import WrenchStamped as WrenchStamped
 from tfbus.data import do_transform as do_transform
 from tfbus.errors import AheadError as AheadError

@@ -1,5 +1,6 @@
 """"""
 
+import json
 import math
 from array import array
 from base64 import b64encode
@@ -13,18 +14,27 @@ from support.stamped_data import Header, Point, PointMessage, Time
 
 from tfbus import (
     LATEST,
+    AccelStamped,
+    Imu,
+    InertiaStamped,
     InvalidTransformError,
     LaserScan,
+    NavSatFix,
+    Odometry,
+    Path,
     PointCloud,
     PointStamped,
     Polygon,
+    PoseArray,
     PoseStamped,
     PoseWithCovarianceStamped,
     QuaternionStamped,
     Transform,
     TransformStamped,
     TwistStamped,
+    TwistWithCovarianceStamped,
     Vector3Stamped,
+    VelocityStamped,
     WrenchStamped,
     do_transform,
 )
@@ -47,6 +57,61 @@ SIMPLE: list[tuple[dict[str, Any], Any]] = [
         {"child_frame_id": "base", "transform": {"translation": V, "rotation": Q}},
         TransformStamped("map", "base", STAMP, TRANSFORM),
     ),
+    ({"accel": {"linear": V, "angular": W}}, AccelStamped("map", STAMP, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))),
+    (
+        {"body_frame_id": "base", "reference_frame_id": "odom", "velocity": {"linear": V, "angular": W}},
+        VelocityStamped("map", STAMP, "base", "odom", (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
+    ),
+]
+SIX, THREE = [float(number) for number in range(36)], [float(number) for number in range(9)]
+SINCE = {"sec": 4, "nanosec": 9}
+# Messages with arrays, and some of the plain data that are made of them.
+WITH_ARRAYS: list[tuple[dict[str, Any], type, dict[str, Any]]] = [
+    (
+        {
+            "child_frame_id": "base",
+            "pose": {"pose": POSE, "covariance": SIX},
+            "twist": {"twist": {"linear": V, "angular": W}, "covariance": SIX[::-1]},
+        },
+        Odometry,
+        {"child": "base", "pose": TRANSFORM, "linear": (1.0, 2.0, 3.0), "angular": (4.0, 5.0, 6.0)},
+    ),
+    (
+        {"twist": {"twist": {"linear": V, "angular": W}, "covariance": SIX}},
+        TwistWithCovarianceStamped,
+        {"linear": (1.0, 2.0, 3.0), "angular": (4.0, 5.0, 6.0)},
+    ),
+    (
+        {
+            "orientation": Q,
+            "orientation_covariance": THREE,
+            "angular_velocity": V,
+            "angular_velocity_covariance": THREE[::-1],
+            "linear_acceleration": W,
+            "linear_acceleration_covariance": THREE,
+        },
+        Imu,
+        {"orientation": (0.5, -0.5, 0.5, -0.5), "angular_velocity": (1.0, 2.0, 3.0), "frame": "map"},
+    ),
+    (
+        {"inertia": {"m": 2.0, "com": V, "ixx": 1.0, "ixy": 2.0, "ixz": 3.0, "iyy": 4.0, "iyz": 5.0, "izz": 6.0}},
+        InertiaStamped,
+        {"mass": 2.0, "center": (1.0, 2.0, 3.0)},
+    ),
+    (
+        {
+            "status": {"status": 1, "service": 3},
+            "latitude": 48.0,
+            "longitude": 11.0,
+            "altitude": 500.0,
+            "position_covariance": THREE,
+            "position_covariance_type": 2,
+        },
+        NavSatFix,
+        {"latitude": 48.0, "longitude": 11.0, "altitude": 500.0, "status": 1, "service": 3, "covariance_type": 2},
+    ),
+    ({"poses": [POSE, POSE]}, PoseArray, {}),
+    ({"poses": [{"header": {"stamp": SINCE, "frame_id": "map"}, "pose": POSE}]}, Path, {}),
 ]
 
 
@@ -76,6 +141,63 @@ def test_messages_become_data_and_data_messages(fields: dict[str, Any], data: An
     assert to_message(data, like=blank) == message
     assert to_message(data, like=as_object(blank)) == as_object(message)
     assert blank == before
+
+
+@pytest.mark.parametrize(("fields", "kind", "values"), WITH_ARRAYS, ids=[kind.__name__ for _, kind, _ in WITH_ARRAYS])
+@pytest.mark.parametrize("ros1", [False, True])
+def test_messages_with_arrays_become_data_and_data_messages(
+    fields: dict[str, Any], kind: Any, values: dict[str, Any], ros1: bool
+) -> None:
+    message = {"header": header(ros1=ros1), **deepcopy(fields)}
+    if ros1 and kind is Path:
+        message["poses"][0]["header"] = {"stamp": {"secs": 4, "nsecs": 9}, "frame_id": "map"}
+    data = from_message(as_object(message))
+    assert type(data) is kind
+    assert (data.frame, data.stamp) == ("map", STAMP)
+    assert {name: getattr(data, name) for name in values} == values
+    assert to_message(data, like=message) == message
+    assert to_message(data, like=as_object(message)) == as_object(message)
+    again = kind.from_dict(json.loads(json.dumps(data.to_dict())))
+    assert to_message(again, like=message) == message
+    if not ros1:
+        assert to_message(from_message(to_message(data)), like=message) == message
+
+
+def test_an_inertial_sensor_says_what_it_does_not_measure() -> None:
+    unknown = [-1.0] + 8 * [0.0]
+    message = {"header": header(), **deepcopy(WITH_ARRAYS[2][0])}
+    message["orientation"], message["angular_velocity_covariance"] = dict.fromkeys("xyzw", 0.0), unknown
+    imu = from_message(message)
+    assert (imu.orientation, imu.angular_velocity, imu.angular_velocity_covariance) == (None, None, None)
+    assert imu.linear_acceleration == (4.0, 5.0, 6.0)
+    moved = to_message(do_transform(imu, TransformStamped("base", "map", STAMP, TRANSFORM)), like=message)
+    assert moved["orientation_covariance"] == moved["angular_velocity_covariance"] == unknown
+    assert from_message(moved).orientation is None
+
+
+def test_a_path_is_in_one_frame_and_may_be_empty() -> None:
+    message: dict[str, Any] = {"header": header(), "poses": [{"header": header("odom"), "pose": POSE}]}
+    with pytest.raises(ValueError, match="pose 0 of the path is in frame 'odom', and the path in 'map'"):
+        from_message(message)
+    message["poses"][0]["header"]["frame_id"] = ""
+    assert from_message(message).poses[0] == TRANSFORM
+    empty = from_message({"header": header(), "poses": []})
+    assert (type(empty), len(empty)) == (PoseArray, 0)
+
+
+def test_the_transforms_of_a_tf_message_become_samples_and_a_tf_message_again() -> None:
+    fields = {"child_frame_id": "base", "transform": {"translation": V, "rotation": Q}}
+    message = {"transforms": [{"header": header(), **fields}, {"header": header("odom"), **fields}]}
+    samples = from_message(as_object(message))
+    assert samples == [TransformStamped(parent, "base", STAMP, TRANSFORM) for parent in ("map", "odom")]
+    assert to_message(samples) == message
+    assert to_message(samples, like=as_object(message)) == as_object(message)
+
+
+def test_a_marker_is_refused_by_name_and_not_taken_for_its_pose() -> None:
+    marker = {"header": header(), "ns": "", "id": 1, "pose": POSE, "points": [V], "scale": V, "frame_locked": False}
+    with pytest.raises(TypeError, match="a dict is not data that can be transformed, for its points and scale"):
+        from_message(marker)
 
 
 def test_leading_slashes_are_gone_and_a_stamp_of_zero_stays() -> None:
@@ -108,7 +230,7 @@ def test_a_polygon_has_the_corners_of_its_message() -> None:
     one = {**message, "polygon": {"points": [{"x": 0.0, "y": 0.0, "z": 0.0}]}}
     assert to_message(data, like=as_object(one)) == as_object(message)
     none = as_object({**message, "polygon": {"points": []}})
-    with pytest.raises(ValueError, match="type of all points"):
+    with pytest.raises(ValueError, match="the type of all points"):
         to_message(data, like=none)
     assert from_message(none).points.shape == (0, 3)
 

@@ -95,6 +95,29 @@ def test_roll_pitch_and_yaw_are_the_fixed_axes_of_transforms3d(xyz: Vector, rpy:
     assert Transform.from_xyz_rpy(xyz, degrees, degrees=True).is_close(t)
 
 
+SEQUENCES = [
+    first + second + third for first in "xyz" for second in "xyz" for third in "xyz" if first != second != third
+]
+
+
+@given(st.sampled_from([*SEQUENCES, *map(str.upper, SEQUENCES)]), vectors(4.0), vectors())
+def test_euler_angles_are_rotations_about_axes_one_after_another(sequence: str, angles: Vector, xyz: Vector) -> None:
+    axes = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+    steps = [Transform.from_axis_angle(axes[a.lower()], angle) for a, angle in zip(sequence, angles, strict=True)]
+    # About the axes of the turning body each step is on the right; about fixed axes it is on the left.
+    first, second, third = steps if sequence.isupper() else steps[::-1]
+    found = Transform.from_euler(sequence, angles, xyz)
+    np.testing.assert_allclose(found.matrix()[:3, :3], (first @ second @ third).matrix()[:3, :3], rtol=0, atol=1e-14)
+    assert found.translation == xyz
+    assert Transform.from_euler(sequence, [math.degrees(angle) for angle in angles], xyz, degrees=True).is_close(found)
+
+
+@pytest.mark.parametrize("sequence", ["xxy", "XYz", "", "rpy", "zyxz"])
+def test_axes_that_are_no_sequence_are_refused(sequence: str) -> None:
+    with pytest.raises(ValueError, match="three axes, such as 'ZYX' or 'xyz'"):
+        Transform.from_euler(sequence, (0.0, 0.0, 0.0))
+
+
 # Conversions both ways
 
 

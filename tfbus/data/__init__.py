@@ -7,21 +7,39 @@
 from tfbus.data.clouds import PointCloud
 from tfbus.data.dispatch import Stamped, check_registered, do_transform
 from tfbus.data.messages import from_message, to_message
-from tfbus.data.points import PointStamped, Polygon, PoseStamped, QuaternionStamped, Vector3Stamped
+from tfbus.data.motion import (
+    AccelStamped,
+    Imu,
+    InertiaStamped,
+    Odometry,
+    TwistWithCovarianceStamped,
+    VelocityStamped,
+)
+from tfbus.data.paths import Path, PoseArray
+from tfbus.data.points import NavSatFix, PointStamped, Polygon, PoseStamped, QuaternionStamped, Vector3Stamped
 from tfbus.data.scans import LaserScan
 from tfbus.data.spatial import PoseWithCovarianceStamped, TwistStamped, WrenchStamped
 
 __all__ = [
+    "AccelStamped",
+    "Imu",
+    "InertiaStamped",
     "LaserScan",
+    "NavSatFix",
+    "Odometry",
+    "Path",
     "PointCloud",
     "PointStamped",
     "Polygon",
+    "PoseArray",
     "PoseStamped",
     "PoseWithCovarianceStamped",
     "QuaternionStamped",
     "Stamped",
     "TwistStamped",
+    "TwistWithCovarianceStamped",
     "Vector3Stamped",
+    "VelocityStamped",
     "WrenchStamped",
     "check_registered",
     "do_transform",

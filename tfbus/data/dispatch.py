@@ -14,6 +14,7 @@ import numpy.typing as npt
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
+from tfbus.geometry.transform_array import locked
 from tfbus.rows import Vector
 from tfbus.stamps import LATEST, Latest, as_array, as_stamp
 
@@ -50,6 +51,20 @@ def as_points(value: npt.ArrayLike) -> npt.NDArray[Any]:
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"points must have shape (n, 3), got {array.shape}")
     return array
+
+
+def as_covariance(value: npt.ArrayLike, name: str, size: int) -> npt.NDArray[np.float64]:
+    """A read-only copy of a covariance, shape (size, size), of a matrix or of its numbers row by row.
+
+    Raises
+    ------
+    ValueError
+        If the shape is another. The message has the shape.
+    """
+    covariance: npt.NDArray[Any] = as_floats(value, name).astype(np.float64)
+    if covariance.shape not in ((size, size), (size * size,)):
+        raise ValueError(f"{name} must have shape ({size}, {size}) or ({size * size},), got {covariance.shape}")
+    return locked(covariance.reshape(size, size))
 
 
 class CopiedByFields:

@@ -6,7 +6,7 @@ roslib or JSON.
 
 from array import array
 from base64 import b64decode
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from typing import Any
 
@@ -14,7 +14,16 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.data.clouds import PointCloud
-from tfbus.data.points import PointStamped, Polygon, PoseStamped, QuaternionStamped, Vector3Stamped
+from tfbus.data.motion import (
+    AccelStamped,
+    Imu,
+    InertiaStamped,
+    Odometry,
+    TwistWithCovarianceStamped,
+    VelocityStamped,
+)
+from tfbus.data.paths import Path, PoseArray
+from tfbus.data.points import NavSatFix, PointStamped, Polygon, PoseStamped, QuaternionStamped, Vector3Stamped
 from tfbus.data.scans import LaserScan
 from tfbus.data.spatial import PoseWithCovarianceStamped, TwistStamped, WrenchStamped
 from tfbus.geometry.stamped import TransformStamped
@@ -52,20 +61,38 @@ def numbers(message: object, names: Iterable[str]) -> tuple[float, ...]:
     return tuple(float(get(message, name)) for name in names)
 
 
-def filled(like: Any, values: Mapping[str, Any]) -> Any:
-    """A copy of a message with other values in some fields; fields that are mappings in `values` are copied likewise.
+_ROS1 = {"sec": "secs", "nanosec": "nsecs"}
+"""The names in messages of ROS 1 that differ from those of ROS 2."""
 
-    A new sequence takes the kind of the old value: an ``array``, an array of numpy, bytes or a list.
+
+def filled(like: Any, values: Mapping[str, Any]) -> Any:
+    """A copy of a message with other values in some fields, which have the names of ROS 2.
+
+    Fields that are mappings in `values` are copied likewise. A new sequence takes the kind of the old value: an
+    ``array``, an array of numpy, bytes or a list; and its messages the type of the first one in the old value.
     """
     result = copy(like)
-    for name, value in values.items():
+    for ros2, value in values.items():
+        name = ros2 if has(like, ros2) else _ROS1.get(ros2, ros2)
         old = get(like, name)
-        new = filled(old, value) if isinstance(value, Mapping) else _as_kind(value, old)
+        if isinstance(value, Mapping):
+            new = filled(old, value)
+        elif isinstance(value, list):
+            new = _parts(name, value, old, like)
+        else:
+            new = _as_kind(value, old)
         if isinstance(result, dict):
             result[name] = new
         else:
             setattr(result, name, new)
     return result
+
+
+def _parts(name: str, values: list[dict[str, Any]], old: Any, like: object) -> list[Any]:
+    samples = list(old)
+    if not samples and values and not isinstance(like, Mapping):
+        raise ValueError(f"the {name} of the message to be like must have one part, which shows the type of all {name}")
+    return [filled(samples[0], value) if samples else value for value in values]
 
 
 def _as_kind(value: Any, old: Any) -> Any:
@@ -191,6 +218,8 @@ def _places(kind: np.dtype[Any]) -> Mapping[str, Any]:
 
 
 _Writer = Callable[[Any], dict[str, Any]]
+_IMU = ("orientation", "angular_velocity", "linear_acceleration")
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _SCAN = ("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min", "range_max")
 
 Data = (
@@ -199,8 +228,17 @@ Data = (
     | QuaternionStamped
     | PoseStamped
     | PoseWithCovarianceStamped
+    | PoseArray
+    | Path
+    | Odometry
     | TwistStamped
+    | TwistWithCovarianceStamped
+    | VelocityStamped
+    | AccelStamped
     | WrenchStamped
+    | InertiaStamped
+    | Imu
+    | NavSatFix
     | Polygon
     | PointCloud
     | LaserScan
@@ -210,28 +248,27 @@ Data = (
 
 
 def from_message(message: object) -> Any:
-    """Stamped data of a message of ROS: of ``geometry_msgs``, or a scan or a cloud of ``sensor_msgs``.
+    """Stamped data of a message of ROS: of ``geometry_msgs``, ``nav_msgs``, ``sensor_msgs`` or ``tf2_msgs``.
 
     Parameters
     ----------
     message : object or mapping
-        With the fields of `PointStamped`, `Vector3Stamped`, `QuaternionStamped`, `PoseStamped`,
-        `PoseWithCovarianceStamped`, `TwistStamped`, `WrenchStamped`, ``PolygonStamped``, `TransformStamped`,
-        `LaserScan` or ``PointCloud2``, in the names of ROS 1 or ROS 2. Arrays may be of any kind, and base64 in a
-        ``PointCloud2`` from JSON.
+        With the fields of a type of `tfbus.data`, of ``PolygonStamped``, ``PointCloud2`` or ``TFMessage``, in the names
+        of ROS 1 or ROS 2. Arrays may be of any kind, and base64 in a ``PointCloud2`` from JSON.
 
     Returns
     -------
-    Data of the type with that name, `Polygon` or `PointCloud`. Leading slashes of frames are removed. A stamp of zero
-    is the stamp 0, not `LATEST`. The points of a cloud and its other fields are views of the message's data, if x, y
-    and z lie side by side and the rows have no gap between them.
+    Data of the type with that name, `Polygon`, `PointCloud`, or a list of `TransformStamped`. Leading slashes of
+    frames are removed. A stamp of zero is the stamp 0, not `LATEST`. The points of a cloud and its other fields are
+    views of the message's data, if x, y and z lie side by side and the rows have no gap between them.
 
     Raises
     ------
     TypeError
-        If the message is not one of these; the error names its fields.
+        If the message is not one of these, whose error names its fields, or is a marker, which has more than a pose.
     ValueError
-        If a value is not valid, or the data of a cloud do not fit its layout.
+        If a value is not valid, a pose of a path is in another frame than the path, or the data of a cloud do not fit
+        its layout.
     InvalidTransformError
         If a frame has no name, or a rotation is invalid.
 
@@ -241,7 +278,15 @@ def from_message(message: object) -> Any:
     ...               "point": {"x": 1.0, "y": 2.0, "z": 0.0}})
     PointStamped(frame='map', stamp=1000000005, point=(1.0, 2.0, 0.0))
     """
-    found = [read for field, read in _READERS.items() if has(message, field)]
+    if has(message, "transforms"):
+        return [from_message(transform) for transform in get(message, "transforms")]
+    if has(message, "frame_locked"):
+        raise TypeError(
+            f"a {type(message).__name__} is not data that can be transformed, for its points and scale belong to its "
+            "pose: send it in its own frame, from which RViz transforms it, or transform a PoseStamped of its pose"
+        )
+    found = [read for names, read in _READERS_OF_SEVERAL.items() if all(has(message, name) for name in names)]
+    found = found or [read for name, read in _READERS.items() if has(message, name)]
     if len(found) == 1 and has(message, "header"):
         header = get(message, "header")
         return found[0](message, str(get(header, "frame_id")).lstrip("/"), _stamp(get(header, "stamp")))
@@ -250,13 +295,13 @@ def from_message(message: object) -> Any:
     raise TypeError(f"a {type(message).__name__} is not a message that can be transformed; its fields are {shown}")
 
 
-def to_message(data: Data, like: Any = dict) -> Any:
+def to_message(data: Data | Sequence[TransformStamped], like: Any = dict) -> Any:
     """A message of ROS with some stamped data.
 
     Parameters
     ----------
-    data : stamped data
-        Of a type that `from_message` gives.
+    data : stamped data, or list of TransformStamped
+        Of a type that `from_message` gives. A list becomes a ``TFMessage``.
     like : object, type or mapping
         A message of the wanted type, whose other fields are copied and which is not changed; or the type itself, if it
         can be made without arguments. By default, a ``dict`` with the names of ROS 2. A cloud is written in the layout
@@ -273,23 +318,25 @@ def to_message(data: Data, like: Any = dict) -> Any:
     ValueError
         If the stamp is `LATEST`, which a message cannot express, or a field of a cloud does not fit.
     """
-    write = _WRITERS.get(type(data))
-    if write is None:
-        raise TypeError(f"a {type(data).__name__} has no message")
-    if data.stamp is LATEST:
-        raise ValueError("a message cannot be stamped LATEST: give the data a stamp")
-    frame = data.parent if isinstance(data, TransformStamped) else data.frame
+    if isinstance(data, Sequence):
+        fields: dict[str, Any] = {"transforms": [to_message(sample) for sample in data]}
+    else:
+        write = _WRITERS.get(type(data))
+        if write is None:
+            raise TypeError(f"a {type(data).__name__} has no message")
+        if data.stamp is LATEST:
+            raise ValueError("a message cannot be stamped LATEST: give the data a stamp")
+        frame = data.parent if isinstance(data, TransformStamped) else data.frame
+        fields = {"header": _header(frame, data.stamp)}
+        if like is dict or not isinstance(data, PointCloud):
+            fields |= write(data)
     if like is dict:
-        return {"header": _header(frame, data.stamp, "sec", "nanosec"), **write(data)}
+        return fields
     target = like() if isinstance(like, type) else like
-    ros1 = has(get(target, "header", "stamp"), "secs")
-    header = _header(frame, data.stamp, *(("secs", "nsecs") if ros1 else ("sec", "nanosec")))
     if isinstance(data, PointCloud):
         counts, content = layout_of(data, target)
-        return filled(target, {"header": header, **counts, "data": content})
-    if isinstance(data, Polygon):
-        return filled(target, {"header": header, "polygon": {"points": _corners(data, target)}})
-    return filled(target, {"header": header, **write(data)})
+        fields |= {**counts, "data": content}
+    return filled(target, fields)
 
 
 def _stamp(stamp: object) -> int:
@@ -298,9 +345,9 @@ def _stamp(stamp: object) -> int:
     return int(seconds) * SECOND + int(nanoseconds)
 
 
-def _header(frame: str, stamp: int | Latest, seconds: str, nanoseconds: str) -> dict[str, Any]:
+def _header(frame: str, stamp: int | Latest) -> dict[str, Any]:
     assert isinstance(stamp, int)
-    return {"stamp": {seconds: stamp // SECOND, nanoseconds: stamp % SECOND}, "frame_id": frame}
+    return {"stamp": {"sec": stamp // SECOND, "nanosec": stamp % SECOND}, "frame_id": frame}
 
 
 def _transform(message: object, translation: str, rotation: str) -> Transform:
@@ -332,17 +379,22 @@ def _read_polygon(message: object, frame: str, stamp: int) -> Polygon:
     return Polygon(frame, stamp, np.array(corners, np.float64).reshape(-1, 3))
 
 
-def _corners(polygon: Polygon, like: object) -> list[Any]:
-    """The corners as points of the type that `like` has."""
-    points = list(get(like, "polygon", "points"))
-    if not points and len(polygon.points) and not isinstance(like, Mapping):
-        raise ValueError("the message to be like must have a point, which shows the type of all points")
-    return [filled(points[0], _xyz(corner)) if points else _xyz(corner) for corner in polygon.points]
-
-
 def _triple(message: object, *names: str) -> Vector:
     x, y, z = numbers(get(message, *names), "xyz")
     return x, y, z
+
+
+def _twist(data: Any) -> dict[str, Any]:
+    return {"linear": _xyz(data.linear), "angular": _xyz(data.angular)}
+
+
+def _covariance(message: object, *names: str) -> npt.NDArray[np.float64]:
+    return as_array(get(message, *names), names[-1], np.float64)
+
+
+def _numbers(covariance: npt.NDArray[np.float64] | None, count: int) -> npt.NDArray[np.float64]:
+    """The numbers of a covariance row by row; zeros, as messages have for an unknown one, without it."""
+    return np.zeros(count) if covariance is None else covariance.ravel()
 
 
 def _read_point(message: object, frame: str, stamp: int) -> PointStamped:
@@ -367,20 +419,154 @@ def _read_pose(message: object, frame: str, stamp: int) -> PoseStamped | PoseWit
     pose = get(message, "pose")
     if not has(pose, "covariance"):
         return PoseStamped(frame, stamp, _transform(pose, "position", "orientation"))
-    covariance = as_array(get(pose, "covariance"), "covariance", np.float64)
+    covariance = _covariance(pose, "covariance")
     return PoseWithCovarianceStamped(frame, stamp, _transform(get(pose, "pose"), "position", "orientation"), covariance)
 
 
-def _read_twist(message: object, frame: str, stamp: int) -> TwistStamped:
-    return TwistStamped(frame, stamp, _triple(message, "twist", "linear"), _triple(message, "twist", "angular"))
+def _read_twist(message: object, frame: str, stamp: int) -> TwistStamped | TwistWithCovarianceStamped:
+    if not has(get(message, "twist"), "covariance"):
+        return TwistStamped(frame, stamp, _triple(message, "twist", "linear"), _triple(message, "twist", "angular"))
+    linear, angular = (_triple(message, "twist", "twist", part) for part in ("linear", "angular"))
+    return TwistWithCovarianceStamped(frame, stamp, linear, angular, _covariance(message, "twist", "covariance"))
+
+
+def _read_odometry(message: object, frame: str, stamp: int) -> Odometry:
+    linear, angular = (_triple(message, "twist", "twist", part) for part in ("linear", "angular"))
+    return Odometry(
+        frame,
+        stamp,
+        str(get(message, "child_frame_id")).lstrip("/"),
+        _transform(get(message, "pose", "pose"), "position", "orientation"),
+        linear,
+        angular,
+        pose_covariance=_covariance(message, "pose", "covariance"),
+        twist_covariance=_covariance(message, "twist", "covariance"),
+    )
+
+
+def _write_odometry(data: Odometry) -> dict[str, Any]:
+    return {
+        "child_frame_id": data.child,
+        "pose": {"pose": _pose(data.pose), "covariance": _numbers(data.pose_covariance, 36)},
+        "twist": {"twist": _twist(data), "covariance": _numbers(data.twist_covariance, 36)},
+    }
+
+
+def _read_poses(message: object, frame: str, stamp: int) -> PoseArray | Path:
+    poses = list(get(message, "poses"))
+    is_path = has(poses[0], "header") if poses else "Path" in type(message).__name__
+    bare = [get(pose, "pose") if is_path else pose for pose in poses]
+    positions = [numbers(get(pose, "position"), "xyz") for pose in bare]
+    orientations = [numbers(get(pose, "orientation"), "xyzw") for pose in bare]
+    if not is_path:
+        return PoseArray(frame, stamp, positions, orientations)
+    for number, pose in enumerate(poses):
+        other = str(get(pose, "header", "frame_id")).lstrip("/")
+        if other not in ("", frame):
+            raise ValueError(f"pose {number} of the path is in frame {other!r}, and the path in {frame!r}")
+    stamps = np.array([_stamp(get(pose, "header", "stamp")) for pose in poses], np.int64)
+    return Path(frame, stamp, positions, orientations, stamps)
+
+
+def _write_poses(data: PoseArray | Path) -> dict[str, Any]:
+    pairs = zip(data.positions.tolist(), data.orientations.tolist(), strict=True)
+    return {"poses": [{"position": _xyz(place), "orientation": _xyz(turn)} for place, turn in pairs]}
+
+
+def _write_path(data: Path) -> dict[str, Any]:
+    poses = _write_poses(data)["poses"]
+    stamped = zip(poses, data.stamps.tolist(), strict=True)
+    return {"poses": [{"header": _header(data.frame, stamp), "pose": pose} for pose, stamp in stamped]}
+
+
+def _read_imu(message: object, frame: str, stamp: int) -> Imu:
+    # A first element of -1 says that the sensor does not measure this, by the comment of sensor_msgs/Imu.
+    covariances = {part: _covariance(message, f"{part}_covariance") for part in _IMU}
+    known = {part: covariance.item(0) != -1.0 for part, covariance in covariances.items()}
+    orientation = numbers(get(message, "orientation"), "xyzw")
+    # Drivers without a compass leave all numbers at zero.
+    known["orientation"] &= any(orientation)
+    rate, acceleration = (_triple(message, part) for part in _IMU[1:])
+    values: tuple[Any, ...] = orientation, rate, acceleration
+    return Imu(
+        frame,
+        stamp,
+        *(value if known[part] else None for part, value in zip(_IMU, values, strict=True)),
+        **{f"{part}_covariance": spread if known[part] else None for part, spread in covariances.items()},  # type: ignore[arg-type]
+    )
+
+
+def _write_imu(data: Imu) -> dict[str, Any]:
+    written: dict[str, Any] = {}
+    for part, unset in zip(_IMU, ((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), strict=True):
+        value = getattr(data, part)
+        covariance = _numbers(getattr(data, f"{part}_covariance"), 9)
+        if value is None:
+            covariance = np.array([-1.0] + 8 * [0.0])
+        written |= {part: _xyz(unset if value is None else value), f"{part}_covariance": covariance}
+    return written
+
+
+def _read_velocity(message: object, frame: str, stamp: int) -> VelocityStamped:
+    body, reference = (str(get(message, name)).lstrip("/") for name in ("body_frame_id", "reference_frame_id"))
+    linear, angular = (_triple(message, "velocity", part) for part in ("linear", "angular"))
+    return VelocityStamped(frame, stamp, body, reference, linear, angular)
+
+
+def _read_accel(message: object, frame: str, stamp: int) -> AccelStamped:
+    return AccelStamped(frame, stamp, _triple(message, "accel", "linear"), _triple(message, "accel", "angular"))
+
+
+def _read_inertia(message: object, frame: str, stamp: int) -> InertiaStamped:
+    xx, xy, xz, yy, yz, zz = numbers(get(message, "inertia"), _MOMENTS)
+    moments = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+    mass = float(get(message, "inertia", "m"))
+    return InertiaStamped(frame, stamp, mass, _triple(message, "inertia", "com"), moments)
+
+
+def _write_inertia(data: InertiaStamped) -> dict[str, Any]:
+    moments = dict(zip(_MOMENTS, data.inertia[np.triu_indices(3)].tolist(), strict=True))
+    return {"inertia": {"m": data.mass, "com": _xyz(data.center), **moments}}
+
+
+def _read_fix(message: object, frame: str, stamp: int) -> NavSatFix:
+    return NavSatFix(
+        frame,
+        stamp,
+        *numbers(message, ("latitude", "longitude", "altitude")),
+        covariance=_covariance(message, "position_covariance"),
+        covariance_type=int(get(message, "position_covariance_type")),
+        status=int(get(message, "status", "status")),
+        service=int(get(message, "status", "service")),
+    )
+
+
+def _write_fix(data: NavSatFix) -> dict[str, Any]:
+    return {
+        "status": {"status": data.status, "service": data.service},
+        "latitude": data.latitude,
+        "longitude": data.longitude,
+        "altitude": data.altitude,
+        "position_covariance": _numbers(data.covariance, 9),
+        "position_covariance_type": data.covariance_type,
+    }
 
 
 def _read_wrench(message: object, frame: str, stamp: int) -> WrenchStamped:
     return WrenchStamped(frame, stamp, _triple(message, "wrench", "force"), _triple(message, "wrench", "torque"))
 
 
-# A message with several of these, such as nav_msgs/Odometry, is refused: the caller has to choose a part.
-_READERS: dict[str, Callable[[object, str, int], Data]] = {
+_Reader = Callable[[object, str, int], Data]
+
+# The readers of messages that have all of some fields, and the readers of messages that have one field. A message with
+# several of the latter, such as a pose and a twist without a child, is refused: the caller has to choose a part.
+_READERS_OF_SEVERAL: dict[tuple[str, ...], _Reader] = {
+    ("child_frame_id", "pose", "twist"): _read_odometry,
+    _IMU: _read_imu,
+    ("body_frame_id", "reference_frame_id", "velocity"): _read_velocity,
+    ("latitude", "longitude", "altitude", "position_covariance"): _read_fix,
+}
+_READERS: dict[str, _Reader] = {
     "point_step": read_cloud,
     "ranges": _read_scan,
     "transform": _read_transform,
@@ -391,6 +577,9 @@ _READERS: dict[str, Callable[[object, str, int], Data]] = {
     "twist": _read_twist,
     "wrench": _read_wrench,
     "polygon": _read_polygon,
+    "poses": _read_poses,
+    "accel": _read_accel,
+    "inertia": _read_inertia,
 }
 _WRITERS: dict[type, _Writer] = {
     PointStamped: lambda data: {"point": _xyz(data.point)},
@@ -398,7 +587,20 @@ _WRITERS: dict[type, _Writer] = {
     QuaternionStamped: lambda data: {"quaternion": _xyz(data.quaternion)},
     PoseStamped: lambda data: {"pose": _pose(data.pose)},
     PoseWithCovarianceStamped: lambda data: {"pose": {"pose": _pose(data.pose), "covariance": data.covariance.ravel()}},
-    TwistStamped: lambda data: {"twist": {"linear": _xyz(data.linear), "angular": _xyz(data.angular)}},
+    PoseArray: _write_poses,
+    Path: _write_path,
+    Odometry: _write_odometry,
+    TwistStamped: lambda data: {"twist": _twist(data)},
+    TwistWithCovarianceStamped: lambda data: {"twist": {"twist": _twist(data), "covariance": data.covariance.ravel()}},
+    VelocityStamped: lambda data: {
+        "body_frame_id": data.body,
+        "reference_frame_id": data.reference,
+        "velocity": _twist(data),
+    },
+    AccelStamped: lambda data: {"accel": _twist(data)},
+    InertiaStamped: _write_inertia,
+    Imu: _write_imu,
+    NavSatFix: _write_fix,
     WrenchStamped: lambda data: {"wrench": {"force": _xyz(data.force), "torque": _xyz(data.torque)}},
     TransformStamped: lambda data: {
         "child_frame_id": data.child,

@@ -1,12 +1,14 @@
-"""Points, directions, orientations and poses."""
+"""Points, directions, orientations and poses; and fixes of a satellite receiver, which are places on the earth."""
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from tfbus.data.dispatch import (
     CopiedByFields,
+    as_covariance,
     as_points,
     as_triple,
     check_header,
@@ -21,7 +23,7 @@ from tfbus.geometry.transform import Transform, from_row
 from tfbus.geometry.transform_array import locked
 from tfbus.plain import PlainData
 from tfbus.rows import Numbers, Quaternion, Vector, as_rotation, rotate
-from tfbus.stamps import AtLike, Latest
+from tfbus.stamps import AtLike, Latest, is_real
 from tfbus.which_kernel import compose_rows, move_point
 
 
@@ -149,6 +151,54 @@ class Polygon(CopiedByFields, PlainData):
     def __post_init__(self) -> None:
         check_header(self)
         object.__setattr__(self, "points", locked(as_points(self.points).copy()))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NavSatFix(CopiedByFields, PlainData):
+    """A place on the earth by a satellite receiver, as sensor_msgs/NavSatFix. Equal only to itself.
+
+    It is not a point of `frame`, which is where the antenna is fixed on the robot, so no transform moves it.
+
+    Parameters
+    ----------
+    frame : str
+        The frame of the antenna.
+    stamp : int or LATEST
+        ns.
+    latitude, longitude : float
+        In degrees, positive to the north and to the east.
+    altitude : float
+        In m above the ellipsoid of WGS 84; NaN if it is not known.
+    covariance : array of shape (3, 3), or 9 numbers row by row, optional
+        Of the position to the east, to the north and up, in m^2. Copied.
+    covariance_type : int
+        0 for an unknown covariance, 1 approximated, 2 only the diagonal is known, 3 known.
+    status : int
+        -1 without a fix, 0 with one, 1 with augmentation by satellites, 2 by stations on the ground.
+    service : int
+        The systems that the receiver uses, a sum of 1 (GPS), 2 (GLONASS), 4 (BeiDou) and 8 (Galileo).
+    """
+
+    frame: str
+    stamp: int | Latest
+    latitude: float
+    longitude: float
+    altitude: float
+    _: KW_ONLY
+    covariance: npt.NDArray[np.float64] | None = None
+    covariance_type: int = 0
+    status: int = 0
+    service: int = 1
+
+    def __post_init__(self) -> None:
+        check_header(self)
+        for name in ("latitude", "longitude", "altitude"):
+            value = getattr(self, name)
+            if not is_real(value):
+                raise TypeError(f"{name} must be a number, not {value!r}")
+            object.__setattr__(self, name, float(value))
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", as_covariance(self.covariance, "covariance", 3))
 
 
 @do_transform.register

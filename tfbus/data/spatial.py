@@ -1,14 +1,13 @@
 """Data with a linear and an angular part: poses with covariance, twists and wrenches."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tfbus.data.dispatch import (
     CopiedByFields,
-    as_floats,
+    as_covariance,
     as_triple,
     check_header,
     check_pose,
@@ -18,7 +17,6 @@ from tfbus.data.dispatch import (
 )
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
-from tfbus.geometry.transform_array import locked
 from tfbus.plain import PlainData
 from tfbus.rows import Numbers, Vector, rotate
 from tfbus.stamps import AtLike, Latest
@@ -44,7 +42,8 @@ class PoseWithCovarianceStamped(CopiedByFields, PlainData):
     -----
     A transform rotates both sides, S -> diag(R, R) S diag(R, R)^T, as tf2_geometry_msgs does. The covariance is about
     the pose's own origin, so no lever arm couples translation and rotation, and the transform adds no error of its own.
-    NaN stays in its 3x3 block. A -1 for "unknown" is rotated like any number: check for it before.
+    NaN stays in its 3x3 block. If a variance is negative, because drivers write -1 for "unknown", the covariance stays
+    as it is.
     """
 
     frame: str
@@ -58,10 +57,7 @@ class PoseWithCovarianceStamped(CopiedByFields, PlainData):
     def __post_init__(self) -> None:
         check_header(self)
         check_pose(self.pose)
-        covariance: npt.NDArray[Any] = as_floats(self.covariance, "covariance").astype(np.float64)
-        if covariance.shape not in ((6, 6), (36,)):
-            raise ValueError(f"covariance must have shape (6, 6) or (36,), got {covariance.shape}")
-        object.__setattr__(self, "covariance", locked(covariance.reshape(6, 6)))
+        object.__setattr__(self, "covariance", as_covariance(self.covariance, "covariance", 6))
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,30 +137,46 @@ class WrenchStamped(PlainData):
 @do_transform.register
 def _(data: PoseWithCovarianceStamped, transform: TransformStamped) -> PoseWithCovarianceStamped:
     header = moved_header(data, transform)
-    turn = transform.transform.matrix()[:3, :3]
-    blocks = data.covariance.reshape(2, 3, 2, 3).swapaxes(1, 2)
-    turned = (turn @ blocks @ turn.T).swapaxes(1, 2).reshape(6, 6)
-    return PoseWithCovarianceStamped(*header, transform.transform @ data.pose, turned)
+    covariance = rotated(data.covariance, transform.transform)
+    return PoseWithCovarianceStamped(*header, transform.transform @ data.pose, covariance)
 
 
 @do_transform.register
 def _(data: TwistStamped, transform: TransformStamped) -> TwistStamped:
     header = moved_header(data, transform)
-    linear, angular = _shifted(data.linear, data.angular, transform.transform)
+    linear, angular = shifted(data.linear, data.angular, transform.transform)
     return TwistStamped(*header, linear, angular)
 
 
 @do_transform.register
 def _(data: WrenchStamped, transform: TransformStamped) -> WrenchStamped:
     header = moved_header(data, transform)
-    torque, force = _shifted(data.torque, data.force, transform.transform)
+    torque, force = shifted(data.torque, data.force, transform.transform)
     return WrenchStamped(*header, force, torque)
 
 
-def _shifted(moment: Vector, line: Vector, target_from_source: Transform) -> tuple[Vector, Vector]:
+def shifted(moment: Vector, line: Vector, target_from_source: Transform) -> tuple[Vector, Vector]:
     """Rotate a line vector and its moment into the target, and take the moment about the target's origin."""
     turn = target_from_source.rotation
     tx, ty, tz = target_from_source.translation
     x, y, z = rotate(turn, *line)
     mx, my, mz = rotate(turn, *moment)
     return (mx + ty * z - tz * y, my + tz * x - tx * z, mz + tx * y - ty * x), (x, y, z)
+
+
+def lever(target_from_source: Transform) -> npt.NDArray[np.float64]:
+    """The adjoint map of a transform, shape (6, 6), which `shifted` applies; the linear part comes first."""
+    matrix = target_from_source.matrix()
+    turn, (x, y, z) = matrix[:3, :3], matrix[:3, 3]
+    skew = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    return np.block([[turn, skew @ turn], [np.zeros((3, 3)), turn]])
+
+
+def rotated(covariance: npt.NDArray[np.float64], target_from_source: Transform) -> npt.NDArray[np.float64]:
+    """A covariance of one or two vectors along the axes of the target; one with a negative variance is unknown."""
+    if (covariance.diagonal() < 0.0).any():
+        return covariance
+    turn = target_from_source.matrix()[:3, :3]
+    count = len(covariance) // 3
+    blocks = covariance.reshape(count, 3, count, 3).swapaxes(1, 2)
+    return (turn @ blocks @ turn.T).swapaxes(1, 2).reshape(covariance.shape)

@@ -152,6 +152,51 @@ class Transform:
         return cls.from_wxyz(xyz, euler2quat(roll, pitch, yaw, "sxyz"))
 
     @classmethod
+    def from_euler(
+        cls, sequence: str, angles: Numbers, translation: Numbers = (0.0, 0.0, 0.0), *, degrees: bool = False
+    ) -> "Transform":
+        """From three rotations about axes, one after another, and a translation in m.
+
+        Parameters
+        ----------
+        sequence : str
+            The three axes, as in SciPy: ``"ZYX"`` turns about z, then about the new y, then about the new x;
+            ``"xyz"`` turns about the fixed x, then the fixed y, then the fixed z. Neighbours differ.
+        angles : sequence of 3 floats
+            In rad, in the order of `sequence`.
+        translation : sequence of 3 floats
+            In m.
+        degrees : bool
+            Whether `angles` are in degrees instead.
+
+        Raises
+        ------
+        ValueError
+            If `sequence` is none.
+        InvalidTransformError
+            If a number is not finite, or a length is wrong.
+
+        Examples
+        --------
+        >>> Transform.from_euler("ZYX", (90.0, 0.0, 0.0), degrees=True).is_close(
+        ...     Transform.from_xyz_rpy((0.0, 0.0, 0.0), (0.0, 0.0, 90.0), degrees=True))
+        True
+        """
+        from transforms3d.euler import euler2quat
+
+        code = ("r" if sequence.isupper() else "s") + sequence.lower()
+        first, second, third = as_floats(angles, 3, "angles")
+        if degrees:
+            first, second, third = map(math.radians, (first, second, third))
+        try:
+            wxyz = euler2quat(first, second, third, code)
+        except KeyError:
+            raise ValueError(
+                f"sequence must be three axes, such as 'ZYX' or 'xyz', whose neighbours differ, not {sequence!r}"
+            ) from None
+        return cls.from_wxyz(translation, wxyz)
+
+    @classmethod
     def from_axis_angle(cls, axis: Numbers, angle: float, translation: Numbers = (0.0, 0.0, 0.0)) -> "Transform":
         """From a rotation by `angle` (rad) about `axis` (any length but zero), and a translation in m."""
         from transforms3d.quaternions import axangle2quat
