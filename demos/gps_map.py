@@ -14,15 +14,15 @@ from tfbus.earth import Datum
 DATUM = Datum(54.3213, 10.1348, 40.0)
 
 
-def fixes() -> list[tuple[tfbus.NavSatFix, float]]:
-    """A fix and the heading in degrees, clockwise from north, at each tenth of the circle."""
+def fixes() -> list[tuple[int, tfbus.NavSatFix, float]]:
+    """A stamp, a fix and the heading in degrees, clockwise from north, at each tenth of the circle."""
     found = []
     for step in range(10):
         angle = math.tau * step / 10
         # To the north first, and then to the left.
         latitude, longitude, height = DATUM.from_map((50.0 * math.cos(angle), 50.0 * math.sin(angle), 1.0))
         stamp = tfbus.from_seconds(step)
-        found.append((tfbus.NavSatFix("gps", stamp, latitude, longitude, height), -math.degrees(angle)))
+        found.append((stamp, tfbus.NavSatFix("gps", stamp, latitude, longitude, height), -math.degrees(angle)))
     return found
 
 
@@ -30,12 +30,12 @@ async def main() -> None:
     with tfbus.Bus(tfbus.SimulatedClock()) as bus, tfbus.Buffer(bus) as buffer:
         boat = tfbus.TransformBroadcaster(bus, "receiver")
         bus.publish(DATUM.sample("map"))
-        for fix, heading in fixes():
+        for stamp, fix, heading in fixes():
             place = DATUM.point(fix).point
             ned_from_frd = tfbus.Transform.from_euler("ZYX", (heading, 0.0, 0.0), degrees=True)
             enu_from_flu = ENU_FROM_NED @ ned_from_frd @ FRD_FROM_FLU
-            boat.send("map", "base_link", tfbus.Transform(place, enu_from_flu.rotation), at=fix.stamp)
-            buoy = tfbus.PointStamped("base_link", fix.stamp, (20.0, 0.0, 0.0))
+            boat.send("map", "base_link", tfbus.Transform(place, enu_from_flu.rotation), at=stamp)
+            buoy = tfbus.PointStamped("base_link", stamp, (20.0, 0.0, 0.0))
             in_map = await buffer.transform(buoy, "map", timeout=1.0)
             latitude, longitude, _ = DATUM.from_map(in_map.point)
             print(

@@ -233,18 +233,18 @@ def test_the_demo_of_a_path_agrees_with_the_cycloid_that_the_tool_goes_along() -
     assert late == "at 5 s and 11 s there is an answer: [True, False]"
 
 
-@pytest.mark.thorough
 def test_the_demo_of_a_boat_finds_the_buoy_20_m_ahead_by_its_compass() -> None:
     pyproj = pytest.importorskip("pyproj", reason="needs pyproj")
-    demo = load("gps_map")
-    spots = [tuple(map(float, line.partition(": ")[2].split())) for line in output_of("gps_map")]
-    for (fix, heading), (latitude, longitude) in zip(demo["fixes"](), spots, strict=True):
+    demo = load("gps_map.py")
+    spots = [tuple(map(float, line.partition(": ")[2].split())) for line in output_of("gps_map.py")]
+    for (_, fix, heading), (latitude, longitude) in zip(demo["fixes"](), spots, strict=True):
         ahead, _, distance = pyproj.Geod(ellps="WGS84").inv(fix.longitude, fix.latitude, longitude, latitude)
         # The places are printed to a tenth of a metre.
         assert distance == pytest.approx(20.0, abs=0.2)
         assert math.remainder(ahead - heading, 360.0) == pytest.approx(0.0, abs=0.5)
 
 
+@pytest.mark.thorough
 def test_the_demo_of_drivers_in_threads_loses_nothing_and_keeps_each_drivers_order() -> None:
     refused, counted, apart = output_of("driver_threads.py")
     assert re.fullmatch(r"RuntimeError: .*bus\.threadsafe.*", refused)
