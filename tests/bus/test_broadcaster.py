@@ -3,10 +3,20 @@
 import math
 from collections.abc import Callable
 
+import anyio
 import pytest
 from support.samples import moving
 
-from tfbus import Buffer, Bus, InvalidTransformError, SimulatedClock, Transform, TransformBroadcaster, TransformStamped
+from tfbus import (
+    Buffer,
+    Bus,
+    InvalidTransformError,
+    LookupTimeoutError,
+    SimulatedClock,
+    Transform,
+    TransformBroadcaster,
+    TransformStamped,
+)
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 pytestmark = pytest.mark.anyio
@@ -28,6 +38,47 @@ def test_a_sample_has_the_stamp_of_the_clock_and_the_authority() -> None:
     assert {(sample.parent, sample.child, sample.transform, sample.authority) for sample in got} == {
         ("odom", "base", HERE, "odometry")
     }
+
+
+@pytest.mark.parametrize("prefix", [None, "robot1/"])
+async def test_a_correction_waits_for_the_odometry_of_its_instant_and_puts_the_base_where_it_was_estimated(
+    prefix: str | None,
+) -> None:
+    clock = SimulatedClock(start=0)
+    with Bus(clock) as bus, Buffer(bus, prefix=prefix) as buffer:
+        odometry, localisation = (TransformBroadcaster(bus, name, prefix=prefix) for name in ("odometry", "amcl"))
+        odometry.send("odom", "base", Transform.from_xyz_rpy((1.0, 2.0, 0.0), (0.0, 0.0, 0.3)), at=100)
+        estimate = Transform.from_xyz_rpy((5.5, 4.0, 0.0), (0.0, 0.0, 1.0))
+        sent: list[TransformStamped] = []
+
+        async def correct() -> None:
+            correction = localisation.correct(
+                "map", "odom", base="base", pose=estimate, at=200, buffer=buffer, timeout=1.0, post_date=1e-7
+            )
+            sent.append(await correction)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(correct)
+            await anyio.wait_all_tasks_blocked()
+            assert sent == []
+            odometry.send("odom", "base", Transform.from_xyz_rpy((1.5, 2.25, 0.0), (0.0, 0.0, 0.5)), at=300)
+        assert (sent[0].stamp, sent[0].authority) == (300, "amcl")
+        localisation.send("map", "odom", sent[0].transform, at=200)
+        assert buffer.lookup_nowait("map", "base", 200).transform.is_close(estimate)
+        # Half way, the odometry is at (1.25, 2.125) with a heading of 0.4. Turned by 0.6, it ends at the estimate.
+        x = 5.5 - (1.25 * math.cos(0.6) - 2.125 * math.sin(0.6))
+        y = 4.0 - (1.25 * math.sin(0.6) + 2.125 * math.cos(0.6))
+        assert sent[0].transform.translation == pytest.approx((x, y, 0.0))
+        # The difference of the positions is elsewhere.
+        assert math.dist(sent[0].transform.translation[:2], (5.5 - 1.25, 4.0 - 2.125)) > 1.0
+
+
+async def test_a_correction_without_odometry_publishes_nothing() -> None:
+    with Bus(SimulatedClock(start=0)) as bus, Buffer(bus) as buffer:
+        broadcaster = TransformBroadcaster(bus, "amcl")
+        with pytest.raises(LookupTimeoutError):
+            await broadcaster.correct("map", "odom", base="base", pose=HERE, at=5, buffer=buffer, timeout=0.0)
+        assert buffer.tree.frames() == []
 
 
 def test_send_all_stamps_all_transforms_alike_and_keeps_the_stamps_of_samples() -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from typing import Protocol
 
 import numpy.typing as npt
 
@@ -12,8 +13,17 @@ from tfbus.frames import as_prefix
 from tfbus.geometry.columns import Names
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
-from tfbus.stamps import StampLike, StampsLike
+from tfbus.stamps import StampLike, StampsLike, as_stamp, from_seconds
 from tfbus.tf2_names import says_ours
+
+
+class Awaits(Protocol):
+    """A buffer, as `TransformBroadcaster.correct` needs it."""
+
+    async def lookup(
+        self, target: str, source: str, at: StampLike, /, *, timeout: float | None = None
+    ) -> TransformStamped:
+        """The transform from `source` to `target` at a stamp, as soon as it is known."""
 
 
 @says_ours
@@ -167,6 +177,74 @@ class TransformBroadcaster:
         parent, child = self._on_bus(parent), self._on_bus(child)
         sample = TransformStamped(parent, child, self.bus.clock.now(), transform, self.authority, static=True)
         self._to.publish(sample, self._invalid)
+
+    async def correct(
+        self,
+        parent: str,
+        child: str,
+        *,
+        base: str,
+        pose: Transform,
+        at: StampLike,
+        buffer: Awaits,
+        timeout: float | None = None,
+        post_date: float = 0.0,
+    ) -> TransformStamped:
+        """Publish where `child` is in `parent`, such as ``odom`` in ``map``, so that `base` is at a pose at a stamp.
+
+        A localisation knows where the base is in the map, but the base has a parent already: the frame of its odometry.
+        So it sends that frame. This waits for the odometry of the very instant, and sends
+        ``parent_from_base @ base_from_child``. The difference of two poses is another point, unless the two have the
+        same heading.
+
+        Parameters
+        ----------
+        parent, child : str
+        base : str
+            A frame below `child`.
+        pose : Transform
+            The estimate: maps `base` coordinates into `parent`.
+        at : int
+            ns, the stamp of the estimate.
+        buffer : Buffer
+            Answers where `child` is, seen from `base`, at that stamp, in the names that this method gets.
+        timeout : float, optional
+            The longest wait for the odometry, in s.
+        post_date : float
+            Stamp the sample so many s after `at`, as ``transform_tolerance`` of amcl, so that no listener waits for it.
+
+        Returns
+        -------
+        TransformStamped
+            The sample that was published.
+
+        Raises
+        ------
+        LookupTimeoutError, PastExtrapolationError, DisconnectedError
+            As `Buffer.lookup`. Nothing is published.
+        InvalidTransformError, BusClosedError, TypeError
+            As `send`.
+
+        Examples
+        --------
+        >>> import anyio
+        >>> async def localise() -> None:
+        ...     with Bus() as bus, Buffer(bus) as buffer:
+        ...         TransformBroadcaster(bus, "odometry").send("odom", "base", Transform((9.8, 0.0, 0.0)), at=5)
+        ...         localisation = TransformBroadcaster(bus, "localisation")
+        ...         estimate = Transform((10.0, 1.0, 0.0))
+        ...         await localisation.correct("map", "odom", base="base", pose=estimate, at=5, buffer=buffer)
+        ...         print(buffer.lookup_nowait("map", "base", 5).transform == estimate)
+        >>> anyio.run(localise)
+        True
+        """
+        base_from_child = await buffer.lookup(base, child, at, timeout=timeout)
+        stamp = as_stamp(at) + from_seconds(post_date)
+        sample = TransformStamped(
+            self._on_bus(parent), self._on_bus(child), stamp, pose @ base_from_child.transform, self.authority
+        )
+        self._to.publish(sample, self._invalid)
+        return sample
 
     @contextmanager
     def owning(self, *frames: str) -> Iterator[None]:
