@@ -2,6 +2,7 @@
 
 from tfbus import analysis as analysis
 from tfbus import axes as axes
+from tfbus import camera as camera
 from tfbus import data as data
 from tfbus import earth as earth
 from tfbus import recording as recording

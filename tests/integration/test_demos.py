@@ -244,6 +244,19 @@ def test_the_demo_of_a_boat_finds_the_buoy_20_m_ahead_by_its_compass() -> None:
         assert math.remainder(ahead - heading, 360.0) == pytest.approx(0.0, abs=0.5)
 
 
+def test_the_demo_of_a_lidar_in_a_picture_finds_each_pole_in_the_row_and_column_of_its_instant() -> None:
+    demo = load("lidar_in_picture.py")
+    for pole, line in zip(demo["POLES"], output_of("lidar_in_picture.py"), strict=True):
+        column, row = map(float, re.findall(r"(?:column|row) +([\d.]+)", line))
+        angle = demo["TURN"] * demo["ROW_TIME"] * round(row)
+        # Into the base that has turned by this angle, and to the camera 0.1 m ahead and 0.2 m above.
+        ahead = math.cos(angle) * pole[0] + math.sin(angle) * pole[1] - 0.1
+        left = math.cos(angle) * pole[1] - math.sin(angle) * pole[0]
+        x, y = -left / ahead, (0.2 - pole[2]) / ahead
+        radial = 1.0 - 0.1 * (x * x + y * y) + 0.01 * (x * x + y * y) ** 2
+        assert (column, row) == pytest.approx((320.0 + 400.0 * x * radial, 240.0 + 400.0 * y * radial), abs=0.06)
+
+
 @pytest.mark.thorough
 def test_the_demo_of_drivers_in_threads_loses_nothing_and_keeps_each_drivers_order() -> None:
     refused, counted, apart = output_of("driver_threads.py")
