@@ -98,6 +98,7 @@ _NAMES_IN = {
         "RecorderStatistics",
         "RobotStatistics",
     ),
+    "synchronizer": ("SynchronizedSet", "Synchronizer"),
     "tree.explanation": ("ExplainedEdge", "Explanation"),
     "tree.history": ("Edge", "Outcome"),
     "tree.lookup": ("Hold", "Question"),

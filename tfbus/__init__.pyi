@@ -105,6 +105,8 @@ from tfbus.statistics import LinkStatistics as LinkStatistics
 from tfbus.statistics import QueueStatistics as QueueStatistics
 from tfbus.statistics import RecorderStatistics as RecorderStatistics
 from tfbus.statistics import RobotStatistics as RobotStatistics
+from tfbus.synchronizer import SynchronizedSet as SynchronizedSet
+from tfbus.synchronizer import Synchronizer as Synchronizer
 from tfbus.tree.explanation import ExplainedEdge as ExplainedEdge
 from tfbus.tree.explanation import Explanation as Explanation
 from tfbus.tree.history import Edge as Edge
