@@ -178,3 +178,35 @@ def test_finite_numbers_whose_length_overflows_are_not_physical() -> None:
 def test_a_bound_of_translations_is_a_number_up_to_1e100(bound: Any, error: type[Exception], text: str) -> None:
     with pytest.raises(error, match=f"max_translation must be {text}"):
         as_max_translation(bound)
+
+
+# Products and inverses
+
+
+def test_transforms_whose_frames_meet_are_composed_and_keep_the_stamp_of_the_one_that_moves() -> None:
+    turned = Transform.from_xyz_rpy((1.0, 2.0, 0.0), (0.0, 0.0, math.pi / 2))
+    moving = TransformStamped("map", "base", 7, turned, "odometry")
+    mounted = TransformStamped("base", "laser", 3, Transform((0.5, 0.0, 0.0)), static=True)
+    product = moving @ mounted
+    assert (product.parent, product.child, product.stamp, product.static) == ("map", "laser", 7, False)
+    assert product.transform.apply((0.0, 0.0, 0.0)) == pytest.approx((1.0, 2.5, 0.0))
+    back = ~product
+    assert (back.parent, back.child, back.stamp) == ("laser", "map", 7)
+    assert back == ~mounted @ moving.inverse()
+    assert (moving @ ~moving).transform.is_close(Transform.identity())
+    assert (mounted @ ~mounted).static
+
+
+@pytest.mark.parametrize(
+    ("parent", "stamp", "why"),
+    [
+        ("odom", 7, "the frames do not meet: 'map' <- 'base' @ 'odom' <- 'laser'"),
+        ("base", 8, "'map' <- 'base' is at .* look both up at one stamp"),
+    ],
+)
+def test_transforms_that_do_not_meet_in_frame_and_time_are_not_composed(parent: str, stamp: int, why: str) -> None:
+    moving = TransformStamped("map", "base", 7, Transform())
+    with pytest.raises(ValueError, match=why):
+        moving @ TransformStamped(parent, "laser", stamp, Transform())
+    with pytest.raises(TypeError):
+        moving @ Transform()  # type: ignore[operator]

@@ -11,7 +11,7 @@ from tfbus.plain import from_fields, printable
 from tfbus.rows import Row
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, StampLike, as_stamp, format_duration, format_stamp, is_real
 from tfbus.tf2_names import says_ours
-from tfbus.which_kernel import kernel
+from tfbus.which_kernel import compose_rows, invert_row, kernel
 
 if kernel == "python":
     from tfbus._python_kernel import Sample
@@ -162,6 +162,44 @@ class TransformStamped(Sample):
             return answer
         _, _, stamp, row, _, static = answer._fields
         return qualified_answer(target, source, stamp, row, static, *policy_use)
+
+    def inverse(self) -> "TransformStamped":
+        """The transform in the other direction, with the names of the two frames exchanged; also as ``~t``."""
+        parent, child, stamp, row, _, static = self._fields
+        return answer_of(child, parent, stamp, invert_row(row), static)
+
+    def __invert__(self) -> "TransformStamped":
+        return self.inverse()
+
+    def __matmul__(self, other: "TransformStamped") -> "TransformStamped":
+        """Compose two transforms whose frames meet: ``map_from_base @ base_from_laser``.
+
+        Raises
+        ------
+        ValueError
+            If the child of the left one is not the parent of the right one, or both move and their stamps differ.
+
+        Examples
+        --------
+        >>> map_from_base = TransformStamped("map", "base", 5, Transform((2.0, 0.0, 0.0)))
+        >>> base_from_laser = TransformStamped("base", "laser", 0, Transform((0.1, 0.0, 0.2)), static=True)
+        >>> print(map_from_base @ base_from_laser)
+        map <- laser at 0.000 s: Transform(translation=(2.1, 0.0, 0.2), rotation=(0.0, 0.0, 0.0, 1.0))
+        """
+        if not isinstance(other, TransformStamped):
+            return NotImplemented
+        if self.child != other.parent:
+            raise ValueError(
+                f"the frames do not meet: {self.parent!r} <- {self.child!r} @ {other.parent!r} <- {other.child!r}"
+            )
+        stamp = other.stamp if self.static else self.stamp
+        if not (self.static or other.static or self.stamp == other.stamp):
+            raise ValueError(
+                f"{self.parent!r} <- {self.child!r} is at {format_stamp(self.stamp)}, and {other.parent!r} <- "
+                f"{other.child!r} at {format_stamp(other.stamp)}: look both up at one stamp"
+            )
+        row = compose_rows(self._row, other._row)
+        return answer_of(self.parent, other.child, stamp, row, self.static and other.static)
 
     def __eq__(self, other: object) -> bool:
         return self._fields == other._fields if isinstance(other, TransformStamped) else NotImplemented
