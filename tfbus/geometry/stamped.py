@@ -181,10 +181,10 @@ class TransformStamped(Sample):
 
         Examples
         --------
-        >>> map_from_base = TransformStamped("map", "base", 5, Transform((2.0, 0.0, 0.0)))
+        >>> map_from_base = TransformStamped("map", "base", 5_000_000_000, Transform((2.0, 0.0, 0.0)))
         >>> base_from_laser = TransformStamped("base", "laser", 0, Transform((0.1, 0.0, 0.2)), static=True)
         >>> print(map_from_base @ base_from_laser)
-        map <- laser at 0.000 s: Transform(translation=(2.1, 0.0, 0.2), rotation=(0.0, 0.0, 0.0, 1.0))
+        map <- laser at 5.000 s: Transform(translation=(2.1, 0.0, 0.2), rotation=(0.0, 0.0, 0.0, 1.0))
         """
         if not isinstance(other, TransformStamped):
             return NotImplemented

@@ -184,7 +184,8 @@ class Transform:
         """
         from transforms3d.euler import euler2quat
 
-        code = ("r" if sequence.isupper() else "s") + sequence.lower()
+        # Mixed letters are left alone, and are no sequence.
+        code = f"r{sequence.lower()}" if sequence.isupper() else f"s{sequence}"
         first, second, third = as_floats(angles, 3, "angles")
         if degrees:
             first, second, third = map(math.radians, (first, second, third))
