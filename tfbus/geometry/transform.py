@@ -184,8 +184,7 @@ class Transform:
         """
         from transforms3d.euler import euler2quat
 
-        # Mixed letters are left alone, and are no sequence.
-        code = f"r{sequence.lower()}" if sequence.isupper() else f"s{sequence}"
+        code = f"r{sequence.lower()}" if sequence.isupper() else f"s{sequence}" if sequence.islower() else ""
         first, second, third = as_floats(angles, 3, "angles")
         if degrees:
             first, second, third = map(math.radians, (first, second, third))
