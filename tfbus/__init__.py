@@ -24,6 +24,7 @@ _NAMES_IN = {
         "PoseWithCovarianceStamped",
         "QuaternionStamped",
         "Stamped",
+        "TwistArray",
         "TwistStamped",
         "Vector3Stamped",
         "WrenchStamped",

@@ -176,6 +176,9 @@ def as_stamps(values: StampsLike) -> Stamps:
                 pass
         # numpy would convert a bool beside an int to an int, and all integers beside a float to floats.
         array = as_array(values, "stamps", object)
+    elif getattr(getattr(values, "dtype", None), "tz", None) is not None:
+        # Dates of pandas with a time zone; `numpy.asarray` would make an object of each.
+        array = cast(Any, values).to_numpy("M8[ns]")
     else:
         array = as_array(values, "stamps")
     if array.ndim != 1:

@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from tfbus.geometry.transform import Transform
 from tfbus.rows import Columns, compose, invert
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, from_seconds, time_between
-from tfbus.tree.tree import TransformTree, forest_of
+from tfbus.stamps import as_duration, from_seconds, time_between
+from tfbus.tree.tree import TransformTree, moving_edges
 
 _Points = npt.NDArray[np.float64]
 
@@ -220,14 +220,9 @@ def compare(
 
 def _trajectory(tree: TransformTree, target: str, source: str) -> tuple[_Stamps, _Rows]:
     """The stamps and the poses of a trajectory; stamps without an answer are left out."""
-    frames = set(tree.chain(target, source))
-    edges = [edge for edge in tree.edges() if not edge.static and {edge.parent, edge.child} <= frames]
-    if not edges:
+    stamps = tree.stamps(target, source)
+    if not moving_edges(tree, target, source):
         raise ValueError(f"{source!r} does not move in {target!r}")
-    densest = max(edges, key=lambda edge: edge.samples)
-    forest = forest_of(tree)
-    with forest.lock:
-        stamps = np.array(forest.frames[densest.child].samples_between(STAMP_MIN, STAMP_MAX).stamps, np.int64)
     found = tree.lookup_many(target, source, stamps, out_of_range="nan")
     valid = found.valid
     rows = np.hstack([found.translations[valid], found.rotations[valid]])

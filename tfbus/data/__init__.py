@@ -9,7 +9,7 @@ from tfbus.data.dispatch import Stamped, check_registered, do_transform
 from tfbus.data.messages import from_message, to_message
 from tfbus.data.points import PointStamped, Polygon, PoseStamped, QuaternionStamped, Vector3Stamped
 from tfbus.data.scans import LaserScan
-from tfbus.data.spatial import PoseWithCovarianceStamped, TwistStamped, WrenchStamped
+from tfbus.data.spatial import PoseWithCovarianceStamped, TwistArray, TwistStamped, WrenchStamped
 
 __all__ = [
     "LaserScan",
@@ -20,6 +20,7 @@ __all__ = [
     "PoseWithCovarianceStamped",
     "QuaternionStamped",
     "Stamped",
+    "TwistArray",
     "TwistStamped",
     "Vector3Stamped",
     "WrenchStamped",

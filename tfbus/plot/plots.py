@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from tfbus.plain import printable
 from tfbus.recording.recording import RecordedMessage
 from tfbus.stamps import SECOND, Stamps, time_between
-from tfbus.tree.tree import TransformTree
+from tfbus.tree.tree import TransformTree, moving_edges
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """The colours of M. Okabe and K. Ito, "Color Universal Design" (2008)."""
@@ -140,8 +140,7 @@ def _span(tree: TransformTree) -> tuple[int, int]:
 
 def _common_span(tree: TransformTree, target: str, source: str, newest: int) -> tuple[int, int]:
     """The span that all moving edges cover on the newest path."""
-    frames = set(tree.chain(target, source))
-    edges = [edge for edge in tree.edges() if not edge.static and {edge.parent, edge.child} <= frames]
+    edges = moving_edges(tree, target, source)
     return max((edge.oldest for edge in edges if edge.oldest is not None), default=newest), newest
 
 
