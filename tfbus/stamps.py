@@ -285,6 +285,12 @@ def is_real(value: object) -> bool:
     return kind is float or kind is int or (isinstance(value, Real) and not isinstance(value, (bool, np.timedelta64)))
 
 
+def format_seconds(nanoseconds: int) -> str:
+    """Nanoseconds as seconds with all nine decimals."""
+    whole, rest = divmod(abs(nanoseconds), SECOND)
+    return f"{'-' if nanoseconds < 0 else ''}{whole}.{rest:09d}"
+
+
 def format_stamp(stamp: int) -> str:
     """The exact text of a stamp, in seconds: ``12.500 s``, ``12.500000001 s``."""
     sign = "-" if stamp < 0 else ""

@@ -170,6 +170,17 @@ def test_the_format_of_tum_has_eight_numbers_a_line(recording: Path, tfbus: Comm
     ]
 
 
+def test_the_formats_of_kitti_and_euroc_have_a_matrix_or_the_stamp_in_ns_a_line(
+    recording: Path, tfbus: Command
+) -> None:
+    question = ("query", recording, "map", "base", "--every", "5")
+    kitti = tfbus(*question, "--kitti").stdout.splitlines()
+    assert kitti == [f"1.0 0.0 0.0 {5.0 * k} 0.0 1.0 0.0 0.0 0.0 0.0 1.0 0.0" for k in range(3)]
+    header, *euroc = tfbus(*question, "--euroc").stdout.splitlines()
+    assert header.startswith("#timestamp [ns],")
+    assert euroc == [f"{EPOCH + 5 * k * SECOND},{5.0 * k},0.0,0.0,1.0,0.0,0.0,0.0" for k in range(3)]
+
+
 def test_several_pairs_are_told_apart(recording: Path, tfbus: Command) -> None:
     done = tfbus("query", recording, "map", "base", "base", "laser", "--csv")
     assert done.stdout.splitlines() == [
@@ -251,7 +262,7 @@ def test_a_speed_limit_leaves_out_what_cannot_be(tmp_path: Path, tfbus: Command)
 def test_where_a_line_does_not_fit_the_quaternion_is_on_a_second_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    row = Row("map", "base", 1_396_293_888_050_000_001, [1e12, -2.0, 0.5], [0.0, 0.0, 0.0, 1.0])
+    row = Row("map", "base", 1_396_293_888_050_000_001, (1e12, -2.0, 0.5), (0.0, 0.0, 0.0, 1.0))
     heights = {}
     for width in (60, 103, 104):
         monkeypatch.setenv("COLUMNS", str(width))

@@ -19,17 +19,19 @@ from tfbus.cli.arguments import (
     Step,
     UsageError,
 )
-from tfbus.cli.output import csv_name, csv_writer, format_seconds, say, terminal_width, track, warn, wrapped
+from tfbus.cli.output import csv_name, csv_writer, say, terminal_width, track, warn, wrapped
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions, load_tree
 from tfbus.errors import DisconnectedError, pip_install
 from tfbus.geometry.transform_array import COLUMN_NAMES
+from tfbus.recording.formats import trajectories
 from tfbus.recording.header_stamps import header_stamps
-from tfbus.stamps import LATEST, to_seconds
+from tfbus.rows import Quaternion, Vector
+from tfbus.stamps import LATEST, format_seconds, to_seconds
 from tfbus.tree.tree import TransformTree, moving_edges
 
 MAX_ROWS = 10_000_000
 _CHUNK = 4_096
-Format = Literal["table", "csv", "json", "tum"]
+Format = Literal["table", "csv", "json", "tum", "kitti", "euroc"]
 _BLOCK = 65_536
 _STAMP, _NUMBER = 20, 12
 """The widths of a stamp and of a number in a table."""
@@ -41,8 +43,8 @@ class Row(NamedTuple):
     target: str
     source: str
     stamp: int
-    translation: list[float]
-    rotation: list[float]
+    translation: Vector
+    rotation: Quaternion
 
 
 def query(
@@ -58,6 +60,8 @@ def query(
     as_csv: CsvFlag = False,
     as_json: JsonFlag = False,
     tum: Flag = False,
+    kitti: Flag = False,
+    euroc: Flag = False,
     parquet: Path | None = None,
     max_speed: Positive | None = None,
     topics: TopicOptions = DEFAULT_TOPICS,
@@ -72,7 +76,7 @@ def query(
     Parameters
     ----------
     file
-        A recording: .mcap, .db3 or .bag, or a folder of ROS 2.
+        A recording: .mcap, .db3 or .bag, a folder of ROS 2, or a trajectory of TUM, KITTI or EuRoC.
     target
         The frame in which the transform is expressed.
     source
@@ -95,20 +99,25 @@ def query(
         Print one JSON object a line.
     tum
         Print lines of stamp x y z qx qy qz qw, the format of TUM's trajectories.
+    kitti
+        Print the upper three rows of each matrix, the format of KITTI's trajectories, which has no stamps.
+    euroc
+        Print lines of stamp,x,y,z,qw,qx,qy,qz, the format of EuRoC's trajectories, with stamps in ns.
     parquet
         Write a Parquet file instead.
     max_speed
         Leave out transforms that a frame can only have reached at a higher speed than this, in m/s.
     """
     pairs = _pairs(target, source, further)
-    given: dict[Format, bool] = {"csv": as_csv, "json": as_json, "tum": tum}
+    given: dict[Format, bool] = {"csv": as_csv, "json": as_json, "tum": tum, "kitti": kitti, "euroc": euroc}
     kinds = [kind for kind, wanted in given.items() if wanted]
     if len(kinds) + (parquet is not None) > 1:
-        raise UsageError("--csv, --json, --tum and --parquet are ways to write the same: give one of them")
+        ways = ", ".join(f"--{name}" for name in given)
+        raise UsageError(f"{ways} and --parquet are ways to write the same: give one of them")
     if sum(each is not None for each in (at, every, stamps_of)) + own_stamps > 1:
         raise UsageError("--at, --every, --own-stamps and --stamps-of are different questions: give one of them")
-    if tum and len(pairs) > 1:
-        raise UsageError("--tum has no names of frames: ask for one pair")
+    if kinds and kinds[0] in _TRAJECTORIES and len(pairs) > 1:
+        raise UsageError(f"--{kinds[0]} has no names of frames: ask for one pair")
     tree, start = load_tree(file, topics, max_speed)
     stamps = None if stamps_of is None else _stamps_of(file, stamps_of)
 
@@ -148,7 +157,7 @@ def _stamps_of(file: Path, topic: str) -> npt.NDArray[np.int64]:
 def _one_row(tree: TransformTree, target: str, source: str, at: int | None) -> Iterator[Row]:
     """The transform at a stamp, or the newest one."""
     found = tree.lookup(target, source, LATEST if at is None else at)
-    yield Row(target, source, found.stamp, [*found.transform.translation], [*found.transform.rotation])
+    yield Row(target, source, found.stamp, found.transform.translation, found.transform.rotation)
 
 
 def _rows_at_intervals(tree: TransformTree, target: str, source: str, step: int) -> Iterator[Row]:
@@ -188,7 +197,7 @@ def _rows_at(
         missing += int(np.count_nonzero(~valid))
         columns = (part[valid], found.translations[valid], found.rotations[valid])
         for stamp, translation, rotation in zip(*(column.tolist() for column in columns), strict=True):
-            yield Row(target, source, stamp, translation, rotation)
+            yield Row(target, source, stamp, tuple(translation), tuple(rotation))
     if missing == count:
         # This lookup raises the error that says why.
         yield from _one_row(tree, target, source, int(stamps[0]) if fallback is None else fallback)
@@ -256,9 +265,12 @@ def _print_json(rows: Iterator[Row], _: bool) -> None:
         print(json.dumps({**row._asdict(), "stamp": format_seconds(row.stamp)}))
 
 
-def _print_tum(rows: Iterator[Row], _: bool) -> None:
-    for row in rows:
-        print(format_seconds(row.stamp), *row.translation, *row.rotation)
+def _print_trajectory(kind: trajectories.Format) -> Callable[[Iterator[Row], bool], None]:
+    def print_lines(rows: Iterator[Row], _: bool) -> None:
+        for line in trajectories.lines_of(((row.stamp, (*row.translation, *row.rotation)) for row in rows), kind):
+            print(line)
+
+    return print_lines
 
 
 def _print_table(rows: Iterator[Row], several: bool) -> None:
@@ -283,9 +295,14 @@ def _number(value: float) -> str:
     return text if len(text) <= _NUMBER else f" {value:{_NUMBER - 1}.4e}"
 
 
+_TRAJECTORIES: dict[Format, trajectories.Format] = {
+    "tum": trajectories.TUM,
+    "kitti": trajectories.KITTI,
+    "euroc": trajectories.EUROC,
+}
 _PRINTERS: dict[Format, Callable[[Iterator[Row], bool], None]] = {
     "table": _print_table,
     "csv": _print_csv,
     "json": _print_json,
-    "tum": _print_tum,
+    **{name: _print_trajectory(kind) for name, kind in _TRAJECTORIES.items()},
 }
