@@ -326,7 +326,7 @@ class TransformArray:
         Parameters
         ----------
         start, stop : int, optional
-            The first and the last stamp, in ns, both included; or dates, as `lookup` accepts them.
+            The first and the last stamp, in ns, both included; or dates, as `TransformTree.lookup` accepts them.
 
         Raises
         ------
