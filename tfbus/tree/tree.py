@@ -699,8 +699,8 @@ class TransformTree:
         Examples
         --------
         >>> tree = TransformTree()
-        >>> outcomes = tree.insert_columns("map", "base_link", [0, 100], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]],
-        ...                                [[0.0, 0.0, 0.0, 1.0]] * 2)
+        >>> for stamp in (0, 100):
+        ...     outcome = tree.insert(TransformStamped("map", "base_link", stamp, Transform()))
         >>> tree.stamps("base_link", "map")
         array([  0, 100])
         """
