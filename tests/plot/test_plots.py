@@ -115,6 +115,10 @@ def test_each_axes_has_one_coordinate_of_each_frame_with_its_unit() -> None:
     figure = plot_transforms(turning(), "map", "base")
     labels = [axes.get_ylabel() for axes in figure.axes]
     assert labels == ["x [m]", "roll [deg]", "y [m]", "pitch [deg]", "z [m]", "yaw [deg]"]
+    figure.draw_without_rendering()
+    for column in (figure.axes[::2], figure.axes[1::2]):
+        left, *others = (axes.yaxis.label.get_window_extent().x0 for axes in column)
+        assert others == pytest.approx([left, left])
     assert [axes.get_xlabel() for axes in figure.axes][-2:] == ["time from the start [s]"] * 2
     x, _, y, _, z, yaw = (axes.lines[0] for axes in figure.axes)
     assert np.allclose(x.get_ydata(), x.get_xdata())

@@ -157,6 +157,11 @@ def test_many_twists_are_those_of_each_stamp(drawn: tuple[TransformTree, int, li
     check_many(tree, frame, reference, axes, instants)
 
 
+def test_a_few_twists_of_a_long_history_are_those_of_each_stamp() -> None:
+    tree = tree_of(*(moving("map", "body", k * SECOND, 1e-3 * k * k) for k in range(1_000)))
+    check_many(tree, "body", "map", "map", [500 * SECOND, 0, 999 * SECOND, 700 * SECOND + 1])
+
+
 def check_many(tree: TransformTree, frame: str, reference: str, axes: str, instants: list[int]) -> None:
     """At each instant the twist or the NaN, and with all of them the first error, of a twist there."""
     found = tree.twist_many(frame, reference, instants, expressed_in=axes, out_of_range="nan")
