@@ -31,6 +31,7 @@ _NAMES_IN = {
         "PoseWithCovarianceStamped",
         "QuaternionStamped",
         "Stamped",
+        "TwistArray",
         "TwistStamped",
         "TwistWithCovarianceStamped",
         "Vector3Stamped",

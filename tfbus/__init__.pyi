@@ -36,6 +36,7 @@ from tfbus.data import PoseStamped as PoseStamped
 from tfbus.data import PoseWithCovarianceStamped as PoseWithCovarianceStamped
 from tfbus.data import QuaternionStamped as QuaternionStamped
 from tfbus.data import Stamped as Stamped
+from tfbus.data import TwistArray as TwistArray
 from tfbus.data import TwistStamped as TwistStamped
 from tfbus.data import TwistWithCovarianceStamped as TwistWithCovarianceStamped
 from tfbus.data import Vector3Stamped as Vector3Stamped

@@ -176,6 +176,9 @@ def as_stamps(values: StampsLike) -> Stamps:
                 pass
         # numpy would convert a bool beside an int to an int, and all integers beside a float to floats.
         array = as_array(values, "stamps", object)
+    elif getattr(getattr(values, "dtype", None), "tz", None) is not None:
+        # Dates of pandas with a time zone; `numpy.asarray` would make an object of each.
+        array = cast(Any, values).to_numpy("M8[ns]")
     else:
         array = as_array(values, "stamps")
     if array.ndim != 1:
@@ -280,6 +283,12 @@ def is_real(value: object) -> bool:
     kind = type(value)
     # The usual types first: the check of the abstract class takes ten times as long.
     return kind is float or kind is int or (isinstance(value, Real) and not isinstance(value, (bool, np.timedelta64)))
+
+
+def format_seconds(nanoseconds: int) -> str:
+    """Nanoseconds as seconds with all nine decimals."""
+    whole, rest = divmod(abs(nanoseconds), SECOND)
+    return f"{'-' if nanoseconds < 0 else ''}{whole}.{rest:09d}"
 
 
 def format_stamp(stamp: int) -> str:

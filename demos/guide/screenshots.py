@@ -98,7 +98,7 @@ async def tutorial() -> None:
 def turtles(data: Path) -> None:
     """The coordinates of the two turtles over time."""
     picture = BytesIO()
-    figure = plot_transforms(load(data / "turtlesim.bag"), "world", "turtle1", "turtle2")
+    figure = plot_transforms(load(data / "turtlesim.bag"), "world", "turtle1", "turtle2", recording="turtlesim.bag")
     figure.savefig(picture, dpi=90)
     write("plot_transforms.png", picture.getvalue())
 

@@ -22,8 +22,8 @@ from tfbus.cli.arguments import (
     parse_seconds,
     parse_time,
 )
-from tfbus.cli.output import format_seconds
 from tfbus.cli.recordings import TopicOptions
+from tfbus.stamps import format_seconds
 
 LIMIT = 9_223_372_036 * 1_000_000_000
 

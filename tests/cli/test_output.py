@@ -22,7 +22,6 @@ from tfbus.cli.output import (
     csv_writer,
     format_counts,
     format_numbers,
-    format_seconds,
     format_transform,
     log_lines,
     print_now,
@@ -34,6 +33,7 @@ from tfbus.cli.output import (
     wrapped,
     write_file,
 )
+from tfbus.stamps import format_seconds
 
 
 class Screen(io.StringIO):

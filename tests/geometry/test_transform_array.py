@@ -375,6 +375,44 @@ def test_a_data_frame_has_a_row_for_each_transform(library: str) -> None:
     assert list(ahead(0.0).to_dataframe(library).columns) == ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
 
 
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_a_data_frame_has_dates_in_utc_to_the_nanosecond_and_angles(library: str) -> None:
+    pytest.importorskip(library)
+    stamps = [1_396_293_888_053_123_456, 1_396_293_888_053_123_457]
+    turn = Transform.from_xyz_rpy((1, 2, 3), (0.1, -0.2, 3.0))
+    path = TransformArray([turn.translation] * 2, [turn.rotation] * 2, stamps)
+    frame = path.to_dataframe(library, index="datetime", angles=True)
+    dates = frame.index if library == "pandas" else frame["stamp"]
+    assert list(frame.columns)[-10:] == [
+        "x_m",
+        "y_m",
+        "z_m",
+        "qx",
+        "qy",
+        "qz",
+        "qw",
+        "roll_rad",
+        "pitch_rad",
+        "yaw_rad",
+    ]
+    assert [float(frame[name].to_numpy()[0]) for name in ("roll_rad", "pitch_rad", "yaw_rad")] == pytest.approx(
+        [0.1, -0.2, 3.0]
+    )
+    assert "UTC" in str(dates.dtype)
+    # From any zone back to stamps.
+    away = dates.tz_convert("Asia/Tokyo") if library == "pandas" else dates.dt.convert_time_zone("Asia/Tokyo")
+    again = TransformArray(frame[["x_m", "y_m", "z_m"]], frame[["qx", "qy", "qz", "qw"]], away)
+    assert again.stamps is not None
+    assert again.stamps.tolist() == stamps
+    with pytest.raises(ValueError, match="no stamps"):
+        ahead(0.0).to_dataframe(library, index="datetime")
+    with pytest.raises(ValueError, match="None or 'datetime'"):
+        path.to_dataframe(library, index="date")
+    if library == "pandas":
+        frame.iloc[0, 0] = 5.0
+        assert path[0] == turn
+
+
 def test_a_data_frame_is_of_pandas_or_polars() -> None:
     with pytest.raises(ValueError, match="'pandas' or 'polars', not 'os'"):
         ahead(0.0).to_dataframe("os")

@@ -19,11 +19,12 @@ import anyio
 import httpx
 import pytest
 from support.processes import Program
+from support.samples import moving, static, tree_of
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from tfbus import SimulatedClock
+from tfbus import Bus, SimulatedClock
 from tfbus.cli.commands import tutorial
 from tfbus.testing import simulate
 
@@ -271,6 +272,54 @@ def test_the_demo_of_ros_finds_the_wall_where_the_robot_saw_it() -> None:
     pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
     # The laser is 0.2 m before the base, and sees the wall 4 m away.
     assert output_of("ros_bridge.py") == [f"hit {0.2 + 4.0:.2f} m before the place of the robot, in odom"]
+
+
+@pytest.mark.thorough
+def test_the_demo_of_rerun_logs_a_recording_and_a_bus_alike(tmp_path: Path) -> None:
+    rerun = pytest.importorskip("rerun", reason="pip install rerun-sdk")
+    chunk = pytest.importorskip("rerun.chunk")
+    demo = load("rerun_frames.py")
+    samples = [moving("map", "r 1/base", 1_700_000_000_123_456_789 + k, float(k)) for k in range(3)]
+    samples.append(static("r 1/base", "lidar", 2.0))
+
+    def log_bus() -> None:
+        with Bus() as bus, bus.subscribe(demo["log_batch"]):
+            bus.publish(samples)
+
+    found = []
+    for name, log in (("tree", lambda: demo["log_tree"](tree_of(*samples))), ("bus", log_bus)):
+        with rerun.RecordingStream("test"):
+            rerun.save(tmp_path / name)
+            log()
+            rerun.get_thread_local_data_recording().flush()
+        rows: list[dict[str, Any]] = []
+        for part in chunk.RrdReader(tmp_path / name).stream().to_chunks():
+            if "Transform3D:translation" in part.to_record_batch().schema.names:
+                rows += [{**row, "entity": part.entity_path} for row in part.to_record_batch().to_pylist()]
+        poses = [
+            (
+                row["entity"],
+                getattr(row.get("stamp"), "value", None),
+                *(row[f"Transform3D:{name}"][0] for name in ("parent_frame", "child_frame", "translation")),
+            )
+            for row in rows
+        ]
+        found.append(sorted(poses, key=str))
+    base = r"/tf/r\ 1\/base"
+    assert (
+        found[0]
+        == found[1]
+        == sorted(
+            [
+                *(
+                    (base, sample.stamp, "map", "r 1/base", [float(k), 0.0, 0.0])
+                    for k, sample in enumerate(samples[:3])
+                ),
+                ("/tf/lidar", None, "r 1/base", "lidar", [2.0, 0.0, 0.0]),
+            ],
+            key=str,
+        )
+    )
 
 
 @pytest.mark.thorough

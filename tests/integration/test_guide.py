@@ -205,8 +205,8 @@ def test_a_command_of_files_does_what_it_says(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demos").symlink_to(ROOT / "demos")
     words = shlex.split(command)[1:]
-    files = [word for word in words if word.endswith((".mcap", ".bag"))]
-    outputs = {word for before, word in pairwise(words) if before in ("-o", "--parquet", "--static-to-yaml")}
+    files = [word for word in words if word.endswith((".mcap", ".bag", ".tum"))]
+    outputs = {word for before, word in pairwise(words) if before in ("-o", "--parquet", "--plot", "--static-to-yaml")}
     outputs |= set(files[1:]) if words[0] == "convert" else set()
     for file in set(files) - outputs:
         write_recording(tmp_path / file)

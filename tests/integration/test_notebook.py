@@ -1,5 +1,6 @@
-"""A tree, a buffer and a loaded recording in a real kernel of Jupyter."""
+"""A tree, a buffer, a loaded recording and its figures in a real kernel of Jupyter."""
 
+from base64 import b64decode
 from collections.abc import Iterator
 from typing import Any
 
@@ -35,7 +36,7 @@ class Kernel:
 
         def note(message: dict[str, Any]) -> None:
             assert message["msg_type"] != "error", message["content"]
-            if message["msg_type"] == "execute_result":
+            if message["msg_type"] in ("display_data", "execute_result"):
                 shown.append(message["content"]["data"])
 
         reply = self._client.execute_interactive(cell, timeout=PATIENCE, output_hook=note)
@@ -65,6 +66,30 @@ def test_a_tree_a_buffer_and_a_recording_draw_themselves(kernel: Kernel) -> None
         assert "from &#x27;me&#x27;" in data["text/html"]
     assert "<pre" in recording["text/html"]
     assert "Hz" in recording["text/html"]
+
+
+def test_from_a_recording_to_a_figure_and_a_number_there_is_no_loop(kernel: Kernel) -> None:
+    pytest.importorskip("matplotlib")
+    kernel.run(f"""
+import numpy as np
+from tfbus.analysis import compare
+from tfbus.plot import plot_errors, plot_path, plot_transforms
+from tfbus.recording import load
+tree = load({str(SMALL)!r})
+path = tree.lookup_many("map", "base_link", tree.stamps("map", "base_link"))
+path""")
+    length = "float(np.linalg.norm(np.diff(path.translations, axis=0), axis=1).sum())"
+    assert float(kernel.run(length)["text/plain"]) > 1.0
+    draw = (
+        "plot_transforms(tree, 'map', 'base_link')",
+        "plot_path(tree, 'map', 'base_link')",
+        "plot_errors(compare(tree, tree, 'map', 'base_link'))",
+    )
+    for cell in (*draw, f"import matplotlib.pyplot; {draw[0]}"):
+        # Whether pyplot runs or not, there is one picture.
+        shown = kernel.run(cell)
+        assert len(b64decode(shown["image/png"])) > 10_000, cell
+        assert b64decode(shown["image/png"]).startswith(b"\x89PNG")
 
 
 def test_a_lookup_is_awaited_at_the_top_level_of_a_cell(kernel: Kernel) -> None:

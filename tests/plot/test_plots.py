@@ -1,6 +1,7 @@
 """Figures of paths, of gaps and of transforms over time."""
 
 import math
+from collections.abc import Callable
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -11,8 +12,9 @@ from matplotlib.patches import Rectangle
 from support.samples import over, static, tree_of
 
 from tfbus import SECOND, Transform, TransformStamped, TransformTree
+from tfbus.analysis import compare
 from tfbus.errors import UnknownFrameError
-from tfbus.plot import Reception, plot_gaps, plot_path, plot_transforms
+from tfbus.plot import Reception, plot_errors, plot_gaps, plot_path, plot_transforms
 from tfbus.plot.plots import line_styles, show_in_window, spans_heard
 
 TREE = tree_of(*over("map", "a", (0, 4 * SECOND), speed=1e-9), static("a", "b", 1.0))
@@ -30,7 +32,8 @@ def test_a_path_from_above_has_equal_scales_a_legend_and_marks_of_start_and_end(
     marks = {line.get_marker(): np.asarray(line.get_xdata()).tolist() for line in axes.lines[4:]}
     assert marks == {"o": [1.0], "s": [5.0]}
     [legend] = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]
+    assert [text.get_text() for text in legend.get_texts()] == ["a", "b", "start", "end"]
+    assert [getattr(handle, "get_marker")() for handle in legend.legend_handles[2:]] == ["o", "s"]  # noqa: B009
     colours = [line.get_color() for line in axes.lines]
     assert colours == [colours[0]] * 3 + [colours[3]] * 3
     assert colours[0] != colours[3]
@@ -112,6 +115,10 @@ def test_each_axes_has_one_coordinate_of_each_frame_with_its_unit() -> None:
     figure = plot_transforms(turning(), "map", "base")
     labels = [axes.get_ylabel() for axes in figure.axes]
     assert labels == ["x [m]", "roll [deg]", "y [m]", "pitch [deg]", "z [m]", "yaw [deg]"]
+    figure.draw_without_rendering()
+    for column in (figure.axes[::2], figure.axes[1::2]):
+        left, *others = (axes.yaxis.label.get_window_extent().x0 for axes in column)
+        assert others == pytest.approx([left, left])
     assert [axes.get_xlabel() for axes in figure.axes][-2:] == ["time from the start [s]"] * 2
     x, _, y, _, z, yaw = (axes.lines[0] for axes in figure.axes)
     assert np.allclose(x.get_ydata(), x.get_xdata())
@@ -133,6 +140,70 @@ def test_several_frames_and_recordings_have_lines_and_names_of_their_own() -> No
     assert len({line.get_color() for line in lines}) == 4
     assert figure.get_suptitle() == "in map"
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [str(line.get_label()) for line in lines]
+
+
+def test_where_lines_run_together_each_is_wider_than_the_next() -> None:
+    figure = plot_transforms([("first", turning()), ("second", turning()), ("third", turning())], "map", "base")
+    widths = [line.get_linewidth() for line in figure.axes[0].lines]
+    assert widths == sorted(widths, reverse=True)
+    assert len(set(widths)) == 3
+
+
+@pytest.mark.parametrize(
+    ("turn", "ticks"),
+    [(400.0, [-180, -90, 0, 90, 180]), (130.0, [0, 45, 90, 135]), (50.0, [0, 10, 20, 30, 40, 50]), (1.0, None)],
+)
+def test_angles_have_ticks_at_round_parts_of_a_turn(turn: float, ticks: list[int] | None) -> None:
+    tree = TransformTree()
+    for step in range(41):
+        pose = Transform.from_xyz_rpy((0.0, 0.0, 0.0), (0.0, 0.0, math.radians(turn * step / 40)))
+        tree.insert(TransformStamped("map", "base", step * SECOND // 10, pose))
+    yaw = plot_transforms(tree, "map", "base").axes[5]
+    low, high = yaw.get_ylim()
+    shown = [tick for tick in yaw.get_yticks() if low <= tick <= high]
+    assert len(shown) >= 4
+    assert ticks is None or shown == ticks
+
+
+@pytest.mark.parametrize("draw", [plot_transforms, plot_path])
+def test_the_corner_has_the_name_of_the_recording_and_the_date_of_its_start(draw: Callable[..., Figure]) -> None:
+    start = 1_396_293_888 * SECOND
+    for first, text in ((start, "run.mcap, start: 2014-03-31 19:24:48 UTC"), (0, "run.mcap, start: 0.000 s")):
+        tree = tree_of(*over("map", "a", (first, first + SECOND), speed=0.0))
+        figure = draw(tree, "map", "a", recording="run.mcap")
+        assert text in [axes.get_title(loc="right") for axes in figure.axes]
+    assert "start: 0.000 s" in [axes.get_title(loc="right") for axes in draw(tree, "map", "a").axes]
+    gaps = plot_gaps({"base": heard(10, 11)}, recording="run.mcap")
+    assert gaps.axes[1].get_title(loc="right") == "run.mcap, start: 10.000 s"
+
+
+@pytest.mark.parametrize("align", [False, True])
+def test_errors_are_drawn_over_time_and_on_the_map(align: bool) -> None:
+    """The reference is in the plane of x and z; the estimate is 2 m beside it, and turned by 90 degrees."""
+    wanted, found = TransformTree(), TransformTree()
+    beside = Transform.from_axis_angle((0.0, 1.0, 0.0), math.pi / 2, (0.0, 2.0, 0.0))
+    for k in range(10):
+        pose = Transform((float(k), 0.0, 0.1 * k * k))
+        wanted.insert(TransformStamped("map", "base", k * SECOND, pose))
+        found.insert(TransformStamped("map", "base", k * SECOND, pose @ beside))
+    figure = plot_errors(compare(wanted, found, "map", "base", align=align), "map:base", names=("truth", "slam"))
+    translation, chart, rotation, _ = figure.axes
+    assert (translation.get_ylabel(), rotation.get_ylabel()) == ("translation error [m]", "rotation error [deg]")
+    expected = 0.0 if align else 2.0
+    for axes, value in ((translation, expected), (rotation, 90.0)):
+        curve = axes.lines[0]
+        assert np.asarray(curve.get_xdata()) == pytest.approx(range(10))
+        assert np.asarray(curve.get_ydata()) == pytest.approx([value] * 10, abs=1e-6)
+        legend = axes.get_legend()
+        assert legend is not None
+        assert align or legend.get_texts()[0].get_text().startswith(f"RMSE {value:.3g} ")
+    assert (chart.get_xlabel(), chart.get_ylabel()) == ("x [m]", "z [m]")
+    assert np.asarray(chart.lines[0].get_ydata()) == pytest.approx([0.1 * k * k for k in range(10)])
+    [coloured] = chart.collections
+    colours = coloured.get_array()
+    assert colours is not None
+    assert np.asarray(colours).tolist() == pytest.approx([expected] * 9, abs=1e-6)
+    assert figure.get_suptitle() == f"map:base: slam against truth, {'aligned' if align else 'not aligned'}"
 
 
 def test_changes_of_rounding_do_not_fill_an_axis() -> None:

@@ -35,6 +35,7 @@ from tfbus import (
     Outcome,
     PastExtrapolationError,
     Transform,
+    TransformArray,
     TransformLookupError,
     TransformStamped,
     TransformTree,
@@ -375,6 +376,64 @@ def test_the_samples_on_either_side_of_a_stamp_are_those_that_were_sent() -> Non
         tree.samples_around("bsae", 15)
     with pytest.raises(TypeError, match="from_seconds"):
         tree.samples_around("base", 1.5)  # type: ignore[arg-type]
+
+
+def test_the_samples_of_a_frame_are_given_at_their_own_stamps() -> None:
+    sent = [
+        TransformStamped("map", "base", k * 10, Transform((float(k), 0.0, 0.0), (0.6, 0.0, 0.0, 0.8))) for k in range(5)
+    ]
+    tree = tree_of(*sent[::-1], static("base", "lidar", 3.0, 7), keep=None)
+    found = tree.samples("base")
+    assert list(found) == [sample.transform for sample in sent]
+    assert found.stamps is not None
+    assert found.stamps.tolist() == [0, 10, 20, 30, 40]
+    for start, stop, kept in ((10, 30, [10, 20, 30]), (11, 29, [20]), (41, None, []), (None, 0, [0])):
+        for part in (tree.samples("base", start, stop), found.between(start, stop)):
+            assert part.stamps is not None
+            assert part.stamps.tolist() == kept
+            assert [pose.translation[0] * 10 for pose in part] == kept
+    mount = tree.samples("lidar", 100, 200)
+    assert (mount[0].translation, str(mount.stamps)) == ((3.0, 0.0, 0.0), "[7]")
+    assert len(tree.samples("map")) == 0
+    with pytest.raises(UnknownFrameError):
+        tree.samples("bsae")
+    with pytest.raises(ValueError, match="no stamps"):
+        TransformArray(found.translations, found.rotations).between(1)
+
+
+def test_the_samples_of_several_parents_are_not_mixed() -> None:
+    tree = tree_of(*over("map", "base", (10, 20)), *over("odom", "base", (30, 40)), keep=None)
+    with pytest.raises(ValueError, match=r"'map' first, 'odom' from 0\.00000003 s"):
+        tree.samples("base")
+    assert [len(tree.samples("base", *bounds)) for bounds in ((None, 29), (30, None))] == [2, 2]
+
+
+def test_the_stamps_between_two_frames_are_those_that_all_moving_edges_cover() -> None:
+    tree = tree_of(
+        *over("map", "odom", range(30, 70, 10)),
+        *over("odom", "base", range(25, 75)),
+        static("base", "lidar"),
+        keep=None,
+    )
+    assert tree.stamps("lidar", "map").tolist() == list(range(30, 61))
+    assert tree.stamps("map", "lidar", 20, 32).tolist() == [30, 31, 32]
+    assert tree.stamps("map", "odom").tolist() == [30, 40, 50, 60]
+    assert tree.stamps("base", "lidar").tolist() == []
+    assert tree.lookup_many("map", "lidar", tree.stamps("map", "lidar")).valid.all()
+
+
+@pytest.mark.parametrize("stamps", [list(range(5)), [4, 2, 2, 0, 9]])
+def test_columns_of_a_new_frame_are_stored_as_their_objects_would_be(stamps: list[int]) -> None:
+    moves, turns = [[float(k), 0.0, 0.0] for k in range(5)], [[0.0, 0.0, 0.0, 1.0]] * 5
+    by_columns, by_objects = tree_of(moving("map", "odom", 0)), tree_of(moving("map", "odom", 0))
+    objects = [moving("odom", "base", stamp, float(k)) for k, stamp in enumerate(stamps)]
+    assert by_columns.insert_columns("odom", "base", stamps, moves, turns) == by_objects.insert_many(objects)
+    assert by_columns.edges() == by_objects.edges()
+    assert list(by_columns.samples("base")) == list(by_objects.samples("base"))
+    with pytest.raises(InvalidTransformError, match="loop of parents"):
+        by_columns.insert_columns("base", "map", stamps, moves, turns)
+    assert by_columns.frames() == ["base", "map", "odom"]
+    assert by_columns.parent("map") is None
 
 
 def test_what_is_older_than_a_stamp_can_be_deleted() -> None:

@@ -18,6 +18,7 @@ from tfbus import (
     Latest,
     PastExtrapolationError,
     Transform,
+    TransformLookupError,
     TransformStamped,
     TransformTree,
     TwistStamped,
@@ -146,6 +147,45 @@ def test_twist_is_the_limit_of_differences(drawn: tuple[TransformTree, int, list
     assert (twist.frame, twist.stamp) == (axes, at)
 
 
+@given(trees(), st.data())
+def test_many_twists_are_those_of_each_stamp(drawn: tuple[TransformTree, int, list[str]], data: st.DataObject) -> None:
+    tree, at, frames = drawn
+    frame, reference, axes = (data.draw(st.sampled_from(frames)) for _ in range(3))
+    # The instants of all samples, and beside them.
+    own = [int(stamp) for name in frames for stamp in tree.stamps("root", name)]
+    instants = [at, *own, *(stamp + 1 for stamp in own), *(stamp - 1 for stamp in own)]
+    check_many(tree, frame, reference, axes, instants)
+
+
+def test_a_few_twists_of_a_long_history_are_those_of_each_stamp() -> None:
+    tree = tree_of(*(moving("map", "body", k * SECOND, 1e-3 * k * k) for k in range(1_000)))
+    check_many(tree, "body", "map", "map", [500 * SECOND, 0, 999 * SECOND, 700 * SECOND + 1])
+
+
+def check_many(tree: TransformTree, frame: str, reference: str, axes: str, instants: list[int]) -> None:
+    """At each instant the twist or the NaN, and with all of them the first error, of a twist there."""
+    found = tree.twist_many(frame, reference, instants, expressed_in=axes, out_of_range="nan")
+    assert (found.frame, found.stamps.tolist()) == (axes, instants)
+    errors = []
+    for index, (stamp, linear, angular) in enumerate(zip(instants, found.linear, found.angular, strict=True)):
+        try:
+            one = tree.twist(frame, reference, stamp, expressed_in=axes)
+        except TransformLookupError as error:
+            errors.append((index, error))
+            assert math.isnan(linear[0])
+            assert math.isnan(angular[0])
+        else:
+            check_twist(one, tuple(linear.tolist()), tuple(angular.tolist()))
+    if not errors:
+        tree.twist_many(frame, reference, instants, expressed_in=axes)
+        return
+    with pytest.raises(TransformLookupError) as caught:
+        tree.twist_many(frame, reference, instants, expressed_in=axes)
+    first, wanted = errors[0]
+    assert (type(caught.value), caught.value.index) == (type(wanted), first)
+    assert str(wanted) in str(caught.value)
+
+
 @given(trees(), st.data(), transforms(2.0))
 def test_do_transform_of_a_body_twist_gives_the_twist_of_another_frame_of_the_body(
     drawn: tuple[TransformTree, int, list[str]], data: st.DataObject, mount: Transform
@@ -236,6 +276,22 @@ def test_between_two_parents_a_frame_rests_and_the_new_parent_begins_with_the_ve
     time: float, expected: float
 ) -> None:
     assert speed(reparented(), round(time * SECOND)) == expected
+
+
+def test_many_twists_across_changes_of_the_parent_are_those_of_each_stamp() -> None:
+    instants = [round(time * SECOND) for time in (-1, 0, 0.5, 1, 2, 3, 3.5, 4, 5)]
+    check_many(reparented(), "body", "map", "left", [*instants, 1, SECOND + 1, 3 * SECOND - 1])
+    lone = tree_of(*on_a_line((0, 0.0), (1, 1.0)), static("map", "lift"), *on_a_line((3, 0.0), parent="lift"))
+    check_many(lone, "body", "map", "map", instants)
+    # Between 1 s and 3 s, the body is on an island.
+    island = tree_of(*on_a_line((0, 0.0), (1, 1.0)), *on_a_line((2, 0.0), parent="island"), *on_a_line((3, 0.0)))
+    check_many(island, "body", "map", "map", instants)
+    with pytest.raises(DisconnectedError) as caught:
+        island.twist_many("body", "map", [2 * SECOND, 5 * SECOND // 2], out_of_range="nan")
+    assert caught.value.index == 0
+    assert island.twist_many("body", "map", []).linear.shape == (0, 3)
+    with pytest.raises(ValueError, match="out_of_range"):
+        island.twist_many("body", "map", [0], out_of_range="none")  # type: ignore[arg-type]
 
 
 def test_a_held_frame_moves_with_its_old_parent() -> None:

@@ -8,9 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.geometry.transform import Transform
+from tfbus.geometry.transform_array import TransformArray, from_columns
 from tfbus.rows import Columns, compose, invert
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, from_seconds, time_between
-from tfbus.tree.tree import TransformTree, forest_of
+from tfbus.stamps import as_duration, from_seconds, time_between
+from tfbus.tree.tree import TransformTree, moving_edges
 
 _Points = npt.NDArray[np.float64]
 
@@ -135,6 +136,8 @@ class Comparison:
         The errors of the poses (ATE, APE).
     relative : PoseErrors
         The errors of the steps from one pose to a later one (RPE).
+    reference, estimate : TransformArray
+        The poses that were compared, with the stamps of the reference; the estimate after alignment.
     """
 
     poses: int
@@ -142,6 +145,8 @@ class Comparison:
     alignment: Alignment | None
     absolute: PoseErrors
     relative: PoseErrors
+    reference: TransformArray
+    estimate: TransformArray
 
 
 def compare(
@@ -150,6 +155,7 @@ def compare(
     target: str,
     source: str,
     *,
+    estimate_frames: tuple[str, str] | None = None,
     align: bool = False,
     scale: bool = False,
     max_difference: float = 0.01,
@@ -164,6 +170,8 @@ def compare(
     ----------
     reference, estimate : TransformTree
     target, source : str
+    estimate_frames : tuple of str, optional
+        Target and source in the estimate, if their names are others there.
     align : bool
         Move the estimate as near as possible to the reference first, by Umeyama's method.
     scale : bool
@@ -188,7 +196,8 @@ def compare(
     if delta < 1:
         raise ValueError(f"delta must be at least 1, got {delta}")
     limit = from_seconds(as_duration(max_difference, "max_difference"))
-    ours, theirs = _trajectory(reference, target, source), _trajectory(estimate, target, source)
+    ours = _trajectory(reference, target, source)
+    theirs = _trajectory(estimate, *(estimate_frames or (target, source)))
     first, second = _match(ours[0], theirs[0], limit)
     if not len(first):
         raise ValueError(
@@ -215,19 +224,15 @@ def compare(
         alignment,
         PoseErrors(stamps, distances, _angles(absolute)),
         PoseErrors(stamps[ends], np.linalg.norm(relative[:, :3], axis=1), _angles(relative)),
+        *(from_columns(np.ascontiguousarray(rows.T), stamps=stamps) for rows in (wanted, found)),
     )
 
 
 def _trajectory(tree: TransformTree, target: str, source: str) -> tuple[_Stamps, _Rows]:
     """The stamps and the poses of a trajectory; stamps without an answer are left out."""
-    frames = set(tree.chain(target, source))
-    edges = [edge for edge in tree.edges() if not edge.static and {edge.parent, edge.child} <= frames]
-    if not edges:
+    stamps = tree.stamps(target, source)
+    if not moving_edges(tree, target, source):
         raise ValueError(f"{source!r} does not move in {target!r}")
-    densest = max(edges, key=lambda edge: edge.samples)
-    forest = forest_of(tree)
-    with forest.lock:
-        stamps = np.array(forest.frames[densest.child].samples_between(STAMP_MIN, STAMP_MAX).stamps, np.int64)
     found = tree.lookup_many(target, source, stamps, out_of_range="nan")
     valid = found.valid
     rows = np.hstack([found.translations[valid], found.rotations[valid]])

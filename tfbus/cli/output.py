@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypeVar
 from tfbus.cli.arguments import UsageError
 from tfbus.geometry.transform import Transform
 from tfbus.plain import printable
-from tfbus.stamps import SECOND, format_duration, from_seconds
+from tfbus.stamps import format_duration, from_seconds
 
 ItemT = TypeVar("ItemT")
 
@@ -232,12 +232,6 @@ def csv_writer() -> Any:
 def csv_name(name: str) -> str:
     """A name as a cell of CSV: unchanged for programs and files; escaped for a terminal, which would obey it."""
     return printable(name) if sys.stdout.isatty() else name
-
-
-def format_seconds(nanoseconds: int) -> str:
-    """Nanoseconds as seconds with all nine decimals."""
-    whole, rest = divmod(abs(nanoseconds), SECOND)
-    return f"{'-' if nanoseconds < 0 else ''}{whole}.{rest:09d}"
 
 
 def format_numbers(numbers: Iterable[float]) -> str:

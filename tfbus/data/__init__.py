@@ -18,7 +18,7 @@ from tfbus.data.motion import (
 from tfbus.data.paths import Path, PoseArray
 from tfbus.data.points import NavSatFix, PointStamped, Polygon, PoseStamped, QuaternionStamped, Vector3Stamped
 from tfbus.data.scans import LaserScan
-from tfbus.data.spatial import PoseWithCovarianceStamped, TwistStamped, WrenchStamped
+from tfbus.data.spatial import PoseWithCovarianceStamped, TwistArray, TwistStamped, WrenchStamped
 
 __all__ = [
     "AccelStamped",
@@ -36,6 +36,7 @@ __all__ = [
     "PoseWithCovarianceStamped",
     "QuaternionStamped",
     "Stamped",
+    "TwistArray",
     "TwistStamped",
     "TwistWithCovarianceStamped",
     "Vector3Stamped",

@@ -19,7 +19,7 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
 from tfbus.plain import PlainData
 from tfbus.rows import Numbers, Vector, rotate
-from tfbus.stamps import AtLike, Latest
+from tfbus.stamps import AtLike, Latest, Stamps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +97,31 @@ class TwistStamped(PlainData):
         check_header(self)
         object.__setattr__(self, "linear", as_triple(self.linear, "linear"))
         object.__setattr__(self, "angular", as_triple(self.angular, "angular"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwistArray:
+    """The velocities of a frame at many stamps, as `TransformTree.twist_many` gives them. Equal only to itself.
+
+    Parameters
+    ----------
+    frame : str
+        The frame along whose axes the velocities are given.
+    stamps : integer array of shape (n,)
+        ns.
+    linear : array of shape (n, 3)
+        Velocity in m/s. NaN where there is no answer.
+    angular : array of shape (n, 3)
+        Angular velocity in rad/s; NaN as `linear`.
+    """
+
+    frame: str
+    stamps: Stamps
+    linear: npt.NDArray[np.float64]
+    angular: npt.NDArray[np.float64]
+
+    def __repr__(self) -> str:
+        return f"<TwistArray of {len(self.stamps)} along the axes of {self.frame!r}>"
 
 
 @dataclass(frozen=True, slots=True)

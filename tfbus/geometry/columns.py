@@ -85,6 +85,19 @@ class SampleColumns:
     def __len__(self) -> int:
         return len(self._stamps)
 
+    def part(self, rows: slice) -> "SampleColumns":
+        """Some of the rows; for all of them, parents and children have one name."""
+        return SampleColumns(
+            cast(str, self._parents),
+            cast(str, self._children),
+            self._stamps[rows],
+            self._rows[rows, :3],
+            self._rows[rows, 3:],
+            self._authority,
+            self._static,
+            self._bound,
+        )
+
     def samples(self, refuse: Callable[[InvalidTransformError], object] | None = None) -> Batch:
         """The samples as objects, in order.
 

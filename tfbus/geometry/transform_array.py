@@ -15,7 +15,7 @@ import numpy.typing as npt
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.transform import Transform, from_row
 from tfbus.rows import NORM_TOLERANCE, ROUNDING, Columns, compose, invert, rotate
-from tfbus.stamps import StampsLike, as_array, as_stamps, format_stamp
+from tfbus.stamps import StampLike, StampsLike, as_array, as_stamp, as_stamps, format_stamp
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -41,6 +41,9 @@ _FLOAT = np.dtype(np.float64)
 _INTEGER = np.dtype(np.int64)
 _ndarray = np.ndarray
 _new = object.__new__
+
+COLUMN_NAMES = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+"""The names of the seven columns in all tables: translation in m, and unit quaternion (x, y, z, w)."""
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -212,30 +215,51 @@ class TransformArray:
             raise ValueError(f"transform {int(self.valid.argmin())} is NaN: select the others with [transforms.valid]")
         return Rotation.from_quat(self.rotations)
 
-    def to_dataframe(self, library: str = "pandas") -> Any:
+    def to_dataframe(self, library: str = "pandas", *, index: str | None = None, angles: bool = False) -> Any:
         """A data frame with one row for each transform; needs the library.
 
-        Its columns are ``stamp_ns`` if there are stamps, ``x_m``, ``y_m``, ``z_m``, ``qx``, ``qy``, ``qz``, ``qw``. A
-        transform that is NaN has NaN in all but the first. For dates there is ``pandas.to_datetime(data.stamp_ns)``.
+        Its columns are ``stamp_ns`` if there are stamps, ``x_m``, ``y_m``, ``z_m``, ``qx``, ``qy``, ``qz``, ``qw``, as
+        in the tables of ``tfbus query``. A transform that is NaN has NaN in all but the first.
 
         Parameters
         ----------
         library : str
             ``"pandas"`` or ``"polars"``.
+        index : str, optional
+            ``"datetime"`` for dates in UTC in place of ``stamp_ns``, exact to the ns, with the name ``stamp``: the
+            index in pandas, the first column in polars.
+        angles : bool
+            Whether there are the columns ``roll_rad``, ``pitch_rad`` and ``yaw_rad`` as well, from `as_rpy`.
 
         Raises
         ------
         ImportError
             If the library is not installed.
         ValueError
-            If it is another library.
+            If it is another library, or another index, or there are no stamps for it.
         """
         if library not in ("pandas", "polars"):
             raise ValueError(f"library must be 'pandas' or 'polars', not {library!r}")
-        columns: dict[str, npt.NDArray[Any]] = {} if self._stamps is None else {"stamp_ns": self._stamps}
-        columns |= zip(("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"), self._columns, strict=True)
-        # Copies, because a data frame may be written to.
-        return import_module(library).DataFrame({name: column.copy() for name, column in columns.items()})
+        if index not in (None, "datetime"):
+            raise ValueError(f"index must be None or 'datetime', not {index!r}")
+        stamps = self._stamps
+        if index is not None and stamps is None:
+            raise ValueError("these transforms have no stamps for an index")
+        frames = import_module(library)
+        columns: dict[str, Any] = dict(zip(COLUMN_NAMES, self._columns, strict=True))
+        if angles:
+            columns |= zip(("roll_rad", "pitch_rad", "yaw_rad"), self.as_rpy().T, strict=True)
+        if stamps is not None and index is None:
+            columns = {"stamp_ns": stamps, **columns}
+        if library == "polars":
+            if stamps is not None and index is not None:
+                columns = {"stamp": frames.Series(stamps).cast(frames.Datetime("ns", "UTC")), **columns}
+            return frames.DataFrame(columns)
+        dates = None
+        if stamps is not None and index is not None:
+            dates = frames.DatetimeIndex(stamps.view("M8[ns]"), name="stamp").tz_localize("UTC")
+        # A copy, because a data frame may be written to.
+        return frames.DataFrame(columns, dates, copy=True)
 
     def matrices(self) -> Floats:
         """New homogeneous matrices of shape (n, 4, 4)."""
@@ -295,6 +319,36 @@ class TransformArray:
         if columns is None:
             return NotImplemented
         return from_columns(np.stack(compose(columns, (*self._columns,))), stamps=self._stamps)
+
+    def between(self, start: StampLike | None = None, stop: StampLike | None = None) -> "TransformArray":
+        """The transforms from one stamp to another.
+
+        Parameters
+        ----------
+        start, stop : int, optional
+            The first and the last stamp, in ns, both included; or dates, as `TransformTree.lookup` accepts them.
+
+        Raises
+        ------
+        ValueError
+            If the transforms have no stamps.
+        TypeError, ValueError
+            If a bound is not a stamp.
+
+        Examples
+        --------
+        >>> path = TransformArray([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]] * 2, [10, 20])
+        >>> path.between(15).stamps
+        array([20])
+        """
+        if self._stamps is None:
+            raise ValueError("these transforms have no stamps: select them by indices")
+        chosen = np.ones(len(self), np.bool_)
+        if start is not None:
+            chosen &= self._stamps >= as_stamp(start)
+        if stop is not None:
+            chosen &= self._stamps <= as_stamp(stop)
+        return self[chosen]
 
     def __len__(self) -> int:
         return len(self._columns[0])

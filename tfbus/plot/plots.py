@@ -1,38 +1,66 @@
 """Plots of recordings with matplotlib, and a `Series` as lines of letters for terminals.
 
 `plot_transforms` draws x, y, z and roll, pitch, yaw over time; `plot_path` a path from above or in space; `plot_gaps`
-the times at which each frame was heard, with its periods and delays.
+the times at which each frame was heard, with its periods and delays; `plot_errors` the errors of a comparison. Figures
+belong to no window, and draw themselves in notebooks.
 """
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from io import BytesIO
 from itertools import cycle
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator, MultipleLocator
 
+from tfbus.analysis.compare import Comparison
 from tfbus.plain import printable
 from tfbus.recording.recording import RecordedMessage
-from tfbus.stamps import SECOND, Stamps, time_between
-from tfbus.tree.tree import TransformTree
+from tfbus.stamps import SECOND, Stamps, format_stamp, time_between
+from tfbus.tree.tree import TransformTree, moving_edges
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """The colours of M. Okabe and K. Ito, "Color Universal Design" (2008)."""
 DASHES = ("-", "--", "-.", ":")
 
 
+_WIDEST = 5.0
+"""The greatest width of a line, in points."""
+_FIRST_YEAR = 1980
+
 LONGEST_NAME = 60
 """The greatest length of a name in a figure: a legend with longer names leaves no room for the axes."""
 
 
+class Picture(Figure):
+    """A figure that a notebook shows, also while pyplot does not run."""
+
+    def _repr_png_(self) -> bytes:
+        picture = BytesIO()
+        self.savefig(picture, format="png")
+        return picture.getvalue()
+
+
 def new_figure(figure: Figure | None, width: float, height: float) -> Figure:
     """The figure to draw in: the given one, or a new one of a size in inches."""
-    return Figure(figsize=(width, height), layout="constrained") if figure is None else figure
+    return Picture(figsize=(width, height), layout="constrained") if figure is None else figure
+
+
+def write_corner(axes: Axes, recording: str, start: int) -> None:
+    """Write the name of the recording, and the date of a stamp (ns), above the right end of some axes."""
+    since = datetime.fromtimestamp(start // SECOND, UTC)
+    # A clock that began at zero tells no date.
+    when = format_stamp(start) if since.year < _FIRST_YEAR else f"{since:%Y-%m-%d %H:%M:%S} UTC"
+    text = f"start: {when}"
+    axes.set_title(f"{shown(recording)}, {text}" if recording else text, loc="right", fontsize=7, color="0.4")
 
 
 def shown(name: str) -> str:
@@ -46,9 +74,16 @@ def shown(name: str) -> str:
 
 
 def line_styles(count: int) -> list[dict[str, Any]]:
-    """The colours and dashes of `count` lines; the first 28 are all different."""
+    """The colours, dashes and widths of `count` lines; the first 28 are all different.
+
+    Each line is thinner than the lines below it, so that it does not hide them where they run together.
+    """
     colours = cycle(COLOURS)
-    return [{"color": next(colours), "linestyle": DASHES[i // len(COLOURS) % len(DASHES)]} for i in range(count)]
+    widths = np.linspace(min(1.2 + 1.3 * (count - 1), _WIDEST), 1.2, count).tolist()
+    return [
+        {"color": next(colours), "linestyle": DASHES[i // len(COLOURS) % len(DASHES)], "linewidth": widths[i]}
+        for i in range(count)
+    ]
 
 
 def show_in_window(draw: Callable[[Figure], object]) -> None:
@@ -64,6 +99,8 @@ def show_in_window(draw: Callable[[Figure], object]) -> None:
     RuntimeError
         If matplotlib cannot open a window here.
     """
+    import matplotlib.pyplot as plt
+
     if plt.get_backend().lower() == "agg":
         raise RuntimeError("matplotlib has no window here" if os.environ.get("DISPLAY") else "there is no display")
     draw(plt.figure(layout="constrained", figsize=(10.0, 6.5)))
@@ -101,6 +138,11 @@ class Series:
     translations: Floats
     angles: Floats
     static: bool
+
+    @property
+    def start(self) -> int:
+        """The stamp that `seconds` count from, in ns."""
+        return int(self.stamps[0]) - round(float(self.seconds[0]) * SECOND)
 
 
 def read_series(tree: TransformTree, target: str, source: str, samples: int = SAMPLES) -> Series:
@@ -140,8 +182,7 @@ def _span(tree: TransformTree) -> tuple[int, int]:
 
 def _common_span(tree: TransformTree, target: str, source: str, newest: int) -> tuple[int, int]:
     """The span that all moving edges cover on the newest path."""
-    frames = set(tree.chain(target, source))
-    edges = [edge for edge in tree.edges() if not edge.static and {edge.parent, edge.child} <= frames]
+    edges = moving_edges(tree, target, source)
     return max((edge.oldest for edge in edges if edge.oldest is not None), default=newest), newest
 
 
@@ -208,7 +249,7 @@ GAP = 3.0
 _BINS = 60
 
 
-def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None) -> Figure:
+def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None, *, recording: str = "") -> Figure:
     """Draw a strip for each frame that shows when it was heard, and histograms of all periods and delays.
 
     Parameters
@@ -217,6 +258,8 @@ def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None) 
         By frame, as `read_reception` gives it; at least one.
     figure : matplotlib.figure.Figure, optional
         The figure to draw in; by default a new one, which no window shows.
+    recording : str
+        The name of the recording, for the corner of the figure.
 
     Returns
     -------
@@ -256,6 +299,8 @@ def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None) 
     strips.grid(axis="x", alpha=0.3)
     _histogram(places["periods"], np.concatenate([frame.periods for frame in frames]), "period [ms]")
     _histogram(places["delays"], np.concatenate([frame.delays for frame in frames]), "delay [ms]")
+    result.align_ylabels([places["periods"], places["delays"]])
+    write_corner(places["periods"], recording, start)
     return result
 
 
@@ -335,6 +380,7 @@ def plot_transforms(
     tree: TransformTree | Sequence[tuple[str, TransformTree]],
     target: str,
     *sources: str,
+    recording: str = "",
     figure: Figure | None = None,
 ) -> Figure:
     """Draw the poses of some frames in another one over time.
@@ -348,6 +394,8 @@ def plot_transforms(
         The frame in which the poses are given.
     sources : str
         The frames that are drawn; at least one.
+    recording : str
+        The name of the recording, for the corner of the figure, which has the date of the start as well.
     figure : matplotlib.figure.Figure, optional
         The figure to draw in; by default a new one, which no window shows.
 
@@ -369,7 +417,7 @@ def plot_transforms(
     for (label, series), style in zip(drawn, line_styles(len(drawn)), strict=True):
         for column, values in enumerate((series.translations, _with_breaks(series.angles))):
             for row in range(3):
-                axes[row, column].plot(series.seconds, values[:, row], label=label, linewidth=1.2, **style)
+                axes[row, column].plot(series.seconds, values[:, row], label=label, **style)
     for row in range(3):
         for column in range(2):
             axes[row, column].set_ylabel(_NAMES[column][row])
@@ -380,7 +428,11 @@ def plot_transforms(
                 axes[row, column].set_ylim(middle - _LEAST_SPAN / 2.0, middle + _LEAST_SPAN / 2.0)
     for column in range(2):
         axes[2, column].set_xlabel("time from the start [s]")
+        result.align_ylabels(axes[:, column])
+    for row in range(3):
+        axes[row, 1].yaxis.set_major_locator(AngleLocator())
     result.suptitle(f"in {shown(target)}")
+    write_corner(axes[0, 1], recording, drawn[0][1].start)
     result.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=min(len(drawn), 4))
     return result
 
@@ -407,6 +459,24 @@ def labelled_series(
     ]
 
 
+class AngleLocator(MaxNLocator):
+    """Ticks for degrees: multiples of 90 or 45 for angles of a turn, and otherwise parts of them."""
+
+    def __init__(self) -> None:
+        super().__init__(nbins=6, steps=[1, 1.5, 3, 5, 10])
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        """The ticks from one angle to another, in deg."""
+        span = vmax - vmin
+        for least, step in ((_TURN, 90.0), (_TURN / 3.0, 45.0)):
+            if span > least:
+                return MultipleLocator(step).tick_values(vmin, vmax)
+        return super().tick_values(vmin, vmax)
+
+
+_TURN = 270.0
+
+
 def _with_breaks(angles: Floats) -> Floats:
     """The angles, with NaN after each jump of more than half a turn."""
     broken = angles.copy()
@@ -421,15 +491,16 @@ def plot_path(
     target: str,
     *sources: str,
     three_d: bool = False,
+    recording: str = "",
     figure: Figure | None = None,
 ) -> Figure:
     """Draw the paths of some frames in another one, seen from above or in three dimensions.
 
-    A circle marks the start of each path, a square its end.
+    A circle marks the start of each path, a square its end, as the legend says.
 
     Parameters
     ----------
-    tree, target, sources, figure
+    tree, target, sources, recording, figure
         As `plot_transforms`.
     three_d : bool
         Whether to draw x, y and z; by default only x and y, with the same scale.
@@ -448,16 +519,110 @@ def plot_path(
     axes = result.add_subplot(projection="3d" if three_d else None)
     for (label, series), style in zip(drawn, line_styles(len(drawn)), strict=True):
         points = series.translations[:, : 3 if three_d else 2].T
-        axes.plot(*points, label=label, linewidth=1.5, **style)
+        axes.plot(*points, label=label, **style)
         known = points[:, ~(points != points).any(axis=0)]
-        for place, marker in ((0, "o"), (-1, "s")):
+        for place, marker in _ENDS.values():
             axes.plot(*known[:, place : place + 1 or None], marker=marker, color=style["color"], linestyle="none")
     axes.set_xlabel(f"x in {shown(target)} [m]")
     axes.set_ylabel(f"y in {shown(target)} [m]")
     if three_d:
         axes.set_zlabel(f"z in {shown(target)} [m]")  # type: ignore[attr-defined]
+        # The layout does not count the label of the third axis.
+        if result.get_layout_engine() is not None:
+            result.set_layout_engine("constrained", rect=(0.0, 0.0, 0.93, 1.0))
+        # A flat path leaves room for the numbers of its axis.
+        low, high = axes.get_zlim()  # type: ignore[attr-defined]
+        rise = max(high - low, max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())) / 4.0)
+        axes.set_zlim((low + high - rise) / 2.0, (low + high + rise) / 2.0)  # type: ignore[attr-defined]
     axes.set_aspect("equal", adjustable="datalim" if not three_d else "box")
     axes.grid(alpha=0.3)
+    write_corner(axes, recording, drawn[0][1].start)
+    lines, names = axes.get_legend_handles_labels()
+    lines += [Line2D([], [], color="0.4", linestyle="none", marker=marker) for _, marker in _ENDS.values()]
     # A place inside of the axes that covers no path takes more than a second to find for a long recording.
-    result.legend(loc="outside lower center", ncols=min(len(drawn), 4))
+    result.legend(lines, [*names, *_ENDS], loc="outside lower center", ncols=min(len(drawn) + 2, 4))
     return result
+
+
+_ENDS = {"start": (0, "o"), "end": (-1, "s")}
+"""The place of each end of a path among its points, and its marker."""
+
+
+def plot_errors(
+    comparison: Comparison,
+    title: str = "",
+    *,
+    names: tuple[str, str] = ("reference", "estimate"),
+    figure: Figure | None = None,
+) -> Figure:
+    """Draw the absolute errors of a trajectory over time, and on the map.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        As `tfbus.analysis.compare` gives it.
+    title : str
+        Such as the names of the frames.
+    names : tuple of str
+        Of the reference and of the estimate.
+    figure : matplotlib.figure.Figure, optional
+        The figure to draw in; by default a new one, which no window shows.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        With three axes and a colour bar: the errors in m and in degrees with their RMSE and mean, and both paths, the
+        estimate in the colours of its errors in m. The map shows the two coordinates in which the reference moves most.
+    """
+    errors, stamps = comparison.absolute, comparison.absolute.stamps
+    start = int(stamps[0])
+    seconds = time_between(np.full_like(stamps, start), stamps).astype(np.float64) / SECOND
+    result = new_figure(figure, 11.0, 5.0)
+    places = result.subplot_mosaic([["translation", "map"], ["rotation", "map"]], width_ratios=[1.1, 1.0])
+    statistics = errors.statistics()
+    for kind, values, of, factor, unit in (
+        ("translation", errors.translation, statistics[0], 1.0, "m"),
+        ("rotation", np.degrees(errors.rotation), statistics[1], 180.0 / np.pi, "deg"),
+    ):
+        axes = places[kind]
+        axes.plot(seconds, values, color=COLOURS[0], linewidth=1.2)
+        for name, value, style in (("RMSE", of.rmse, "-"), ("mean", of.mean, "--")):
+            label = f"{name} {value * factor:.3g} {unit}"
+            axes.axhline(value * factor, color=COLOURS[1], linestyle=style, linewidth=1.0, label=label, zorder=1.5)
+        axes.set_ylabel(f"{kind} error [{unit}]")
+        axes.set_ylim(0.0, max(float(values.max()) * 1.05, _LEAST_SPAN))
+        _legend_above(axes)
+        axes.grid(alpha=0.3)
+    places["translation"].sharex(places["rotation"])
+    places["translation"].tick_params(labelbottom=False)
+    places["rotation"].set_xlabel("time from the first pose [s]")
+    result.align_ylabels([places["translation"], places["rotation"]])
+    wanted, found = comparison.reference.translations, comparison.estimate.translations
+    across, up = sorted(np.argsort(np.ptp(wanted, axis=0), kind="stable")[-2:].tolist())
+    chart = places["map"]
+    chart.plot(wanted[:, across], wanted[:, up], color="0.5", linestyle="--", linewidth=1.2, label=shown(names[0]))
+    points = found[:, [across, up]]
+    line = LineCollection(list(np.stack((points[:-1], points[1:]), axis=1)), linewidths=2.0)
+    line.set_array((errors.translation[:-1] + errors.translation[1:]) / 2.0)
+    chart.add_collection(line)
+    chart.plot([], [], color=line.get_cmap()(0.5), linewidth=2.0, label=shown(names[1]))
+    chart.autoscale_view()
+    result.colorbar(line, ax=chart, label="translation error [m]", shrink=0.8)
+    chart.set_xlabel(f"{'xyz'[across]} [m]")
+    chart.set_ylabel(f"{'xyz'[up]} [m]")
+    chart.set_aspect("equal", adjustable="datalim")
+    chart.grid(alpha=0.3)
+    _legend_above(chart)
+    alignment = comparison.alignment
+    how = "not aligned" if alignment is None else "aligned"
+    if alignment is not None and alignment.scale != 1.0:
+        how = f"aligned and scaled by {alignment.scale:.6g}"
+    heading = f"{shown(names[1])} against {shown(names[0])}, {how}"
+    result.suptitle(f"{shown(title)}: {heading}" if title else heading)
+    write_corner(chart, "", start)
+    return result
+
+
+def _legend_above(axes: Axes) -> None:
+    """A legend that hides nothing, above the left end of the axes."""
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=2, frameon=False, fontsize=8)

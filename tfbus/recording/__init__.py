@@ -2,12 +2,12 @@
 
 A `Recorder` writes everything that a bus publishes to an MCAP file, and a `Player` publishes a recording on a bus.
 `load` reads a whole recording into a `tfbus.TransformTree`, `summarise` lists its frames and problems, and
-`open_recording` gives its messages one after the other. `load_static` reads a file with static transforms. The file
-formats are in `tfbus.recording.formats`.
+`open_recording` gives its messages one after the other. `load_static` reads a file with static transforms.
+`save_trajectory` writes poses for the tools of benchmarks. The file formats are in `tfbus.recording.formats`.
 """
 
 from tfbus.errors import RecordingError
-from tfbus.recording.convert import Conversion, Edits, StaticTransform, convert
+from tfbus.recording.convert import Conversion, Edits, StaticTransform, convert, save_trajectory
 from tfbus.recording.examine import examine
 from tfbus.recording.header_stamps import HeaderStamps, header_stamps
 from tfbus.recording.joint_states import load_joint_states
@@ -40,5 +40,6 @@ __all__ = [
     "load_static",
     "open_recording",
     "save_static",
+    "save_trajectory",
     "summarise",
 ]

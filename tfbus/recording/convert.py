@@ -14,8 +14,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
+import numpy as np
+
 from tfbus.errors import InvalidTransformError, RecordingError, pip_install
 from tfbus.frames import check_frame
+from tfbus.geometry.transform_array import TransformArray
 from tfbus.plain import printable
 from tfbus.recording.formats.copies import (
     BagCopy,
@@ -35,6 +38,7 @@ from tfbus.recording.formats.storage import (
     UnfoldError,
     Wanted,
 )
+from tfbus.recording.formats.trajectories import FORMATS, TrajectoryCopy, lines_of
 from tfbus.recording.formats.transforms import (
     ChannelDecoder,
     RawTransform,
@@ -104,7 +108,12 @@ def _bare(name: bytes) -> str:
     return name.decode(errors="surrogateescape").lstrip("/")
 
 
-_COPIES: dict[str, Callable[[Path, str], Copy]] = {".mcap": McapCopy, ".bag": BagCopy, ".db3": SqliteCopy}
+_COPIES: dict[str, Callable[[Path, str], Copy]] = {
+    ".mcap": McapCopy,
+    ".bag": BagCopy,
+    ".db3": SqliteCopy,
+    **dict.fromkeys(FORMATS, TrajectoryCopy),
+}
 _NUMBERS = struct.Struct("<7d")
 
 
@@ -171,7 +180,8 @@ def convert(
     inputs : sequence of str or path-like
         As `open_recording`.
     output : str or path-like
-        A file that ends in ``.mcap``, ``.bag`` (ROS 1) or ``.db3`` (ROS 2).
+        A file that ends in ``.mcap``, ``.bag`` (ROS 1) or ``.db3`` (ROS 2); or, for the trajectory of one moving frame,
+        in ``.tum``, ``.kitti`` or ``.euroc``.
     since, until : int, optional
         The first and the last log time, in ns. With `since`, the static transforms from before come first.
     topics : collection of str, optional
@@ -196,7 +206,7 @@ def convert(
         If an input cannot be read, or the packages are missing.
     ValueError
         If the output has another ending, or is one of the inputs; if `schema` has another value, or does not fit the
-        ending.
+        ending; if the output is a trajectory, and several frames move.
     FileExistsError
         If the output exists already.
     OSError
@@ -236,6 +246,42 @@ def convert(
                 progress(1)
         copy.finish()
     return run.result
+
+
+def save_trajectory(path: str | os.PathLike[str], transforms: TransformArray, *, overwrite: bool = False) -> None:
+    """Write transforms as a trajectory for the tools of benchmarks, such as evo; `load` reads it as well.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Ends in ``.tum``, ``.kitti`` or ``.euroc``. KITTI's has no stamps.
+    transforms : TransformArray
+        With stamps, such as an answer of ``lookup_many``. Numbers keep every bit, stamps their nanoseconds.
+    overwrite : bool
+        Whether to replace an existing file.
+
+    Raises
+    ------
+    ValueError
+        If the path has another ending, or a transform is NaN or has no stamp.
+    FileExistsError
+        If the file exists already.
+    OSError
+        If it cannot be written.
+    """
+    target = Path(path)
+    kind = FORMATS.get(target.suffix)
+    if kind is None:
+        raise ValueError(f"a trajectory must end in {', '.join(FORMATS)}, not {target.name!r}")
+    if transforms.stamps is None:
+        raise ValueError("these transforms have no stamps")
+    if not transforms.valid.all():
+        raise ValueError(f"transform {int(transforms.valid.argmin())} is NaN: take the others with [transforms.valid]")
+    if target.exists() and not overwrite:
+        raise FileExistsError(17, "it is there already", str(target))
+    rows = map(tuple, np.hstack((transforms.translations, transforms.rotations)).tolist())
+    with new_file(target) as part, part.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in lines_of(zip(transforms.stamps.tolist(), rows, strict=True), kind))
 
 
 @contextmanager

@@ -28,6 +28,7 @@ from tfbus.frames import is_frame
 from tfbus.geometry.stamped import MAX_TRANSLATION, Batch, TransformStamped, is_within, not_physical
 from tfbus.plain import printable
 from tfbus.recording.formats.storage import Channel, Packed, Storage, Stored, StoredMessage, blocks_of, pack
+from tfbus.recording.formats.trajectories import TrajectoryStorage, is_text
 from tfbus.recording.formats.transforms import (
     FOXGLOVE_TYPES,
     TF_TYPES,
@@ -198,7 +199,7 @@ class DecodedBlock:
         return iter(self._messages)
 
 
-_FIRST_BYTES: Final = 16
+_FIRST_BYTES: Final = 64
 _SHOWN: Final = 10
 _JOINT_TYPES: Final = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
@@ -415,7 +416,9 @@ def open_recording(
 ) -> Recording:
     """Open a recording of ROS 1 (``.bag``), of ROS 2 (a folder, ``.db3``, ``.mcap``) or of Foxglove (``.mcap``).
 
-    The first bytes of the file decide which format it has, not its name. It may be unfinished, cut off or damaged.
+    The first bytes of the file decide which format it has, not its name. It may be unfinished, cut off or damaged. A
+    text file with a trajectory of TUM, KITTI or EuRoC is a recording of ``base_link`` in ``map``; poses of KITTI, which
+    have no stamps, take them from a file ``times.txt`` beside it, or are 0.1 s apart.
 
     Parameters
     ----------
@@ -445,7 +448,8 @@ def open_recording(
     size, or 64 MiB if that is more, in a nameless temporary file. An index of more than 64 MiB is not used. The
     descriptions of all channels and types take at most 64 MiB. All compressed chunks together unfold to at most 1,000
     times the size of the file, or 1 GiB if that is more; later chunks are left out. Messages of chunks that overlap in
-    time are sorted in memory up to 512 MiB. So reading a hostile file takes at most 2 GiB of memory.
+    time are sorted in memory up to 512 MiB. A trajectory has at most 5 million poses, and 4,096 bytes a line. So
+    reading a hostile file takes at most 2 GiB of memory.
 
     If a writer has left a journal beside an SQLite file, the file is copied to a temporary folder, where SQLite undoes
     the last transaction. If the writer still runs, the original is read.
@@ -489,8 +493,12 @@ def _open_storage(path: Path, folders: bool = False) -> Storage:
             return open_format(path)
         if magic.startswith(first):
             raise RecordingError(f"the file ends after {len(first)} bytes", path=str(path), reason="truncated")
+    if is_text(first):
+        return TrajectoryStorage(path)
     raise RecordingError(
-        "it is not a recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)", path=str(path), reason="foreign"
+        "it is not a recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3), nor a trajectory of TUM, KITTI or EuRoC",
+        path=str(path),
+        reason="foreign",
     )
 
 

@@ -46,7 +46,7 @@ class Segments:
     def __init__(self, samples: Samples, stamps: Stamps) -> None:
         own_stamps, rows = samples.stamps, samples.rows
         self._segments: npt.NDArray[np.intp] | None = own_stamps.searchsorted(stamps, "right") - 1
-        self._elapsed = _nanoseconds(own_stamps[self._segments], stamps)
+        self._elapsed = nanoseconds(own_stamps[self._segments], stamps)
         first = np.arange(len(own_stamps))
         if len(stamps) < len(own_stamps):
             first, self._segments = self._segments, None
@@ -55,7 +55,7 @@ class Segments:
             parents = np.array(samples.parents, object)
             last = np.where(parents[first] == parents[last], last, first)
         a, b = rows[first].T, rows[last].T
-        duration = _nanoseconds(own_stamps[first], own_stamps[last])
+        duration = nanoseconds(own_stamps[first], own_stamps[last])
         duration[first == last] = np.inf
         dot = (a[3:] * b[3:]).sum(axis=0)
         cosine = np.minimum(np.abs(dot), 1.0)
@@ -78,7 +78,7 @@ class Segments:
         return (*moved, *turned)
 
 
-def _nanoseconds(begin: Stamps, end: Stamps) -> Floats:
+def nanoseconds(begin: Stamps, end: Stamps) -> Floats:
     """The time between two stamps; exact for differences that exceed a signed 64-bit integer."""
     return (end - begin).view(np.uint64).astype(np.float64)
 

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data import PointCloud, TwistStamped
+from tfbus.data import PointCloud, TwistArray, TwistStamped
 from tfbus.errors import TransformLookupError
 from tfbus.geometry.columns import Names, SampleColumns
 from tfbus.geometry.stamped import (
@@ -22,11 +22,12 @@ from tfbus.geometry.stamped import (
     check_translations,
     is_within,
 )
-from tfbus.geometry.transform_array import TransformArray, with_stamps
+from tfbus.geometry.transform_array import TransformArray, from_columns, locked, with_stamps
 from tfbus.stamps import (
     LATEST,
     SECOND,
     STAMP_MAX,
+    STAMP_MIN,
     AtLike,
     Latest,
     StampLike,
@@ -45,7 +46,7 @@ from tfbus.tree.history import Edge, FrameHistory, Outcome, SavedFrame, samples_
 from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, Hold, answer, bounds_of, policy_of
 from tfbus.tree.lookup_many import OutOfRange, deskew, lookup_many
 from tfbus.tree.rendering import counted, describe, legend, to_dot, to_html, to_yaml
-from tfbus.tree.twist import twist
+from tfbus.tree.twist import twist, twist_many
 from tfbus.which_kernel import plain_first
 
 
@@ -182,8 +183,17 @@ class TransformTree:
             parents, children, stamps, translations, rotations, authority, static, self.max_translation
         )
         forest = self._forest
-        if columns.plain is not None and forest.paths.commit(forest.frames, forest.readers, columns.plain):
+        if columns.plain is None:
+            return forest.insert(columns.samples())
+        if forest.paths.commit(forest.frames, forest.readers, columns.plain):
             return [Outcome.INSERTED] * len(columns)
+        if len(columns) > 1 and isinstance(parents, str) and isinstance(children, str):
+            # Usually the frame is new: behind its first sample, which alone can close a loop, the others are plain.
+            outcomes = forest.insert(columns.part(slice(1)).samples())
+            rest = columns.part(slice(1, None))
+            if forest.paths.commit(forest.frames, forest.readers, rest.plain):
+                return outcomes + [Outcome.INSERTED] * len(rest)
+            return outcomes + forest.insert(rest.samples())
         return forest.insert(columns.samples())
 
     @property
@@ -486,6 +496,49 @@ class TransformTree:
             stamp, linear, angular = twist(self._forest, frame, reference, at, axes)
         return TwistStamped(axes, stamp, linear, angular)
 
+    def twist_many(
+        self,
+        frame: str,
+        reference: str,
+        stamps: StampsLike,
+        *,
+        expressed_in: str | None = None,
+        out_of_range: OutOfRange = "raise",
+    ) -> TwistArray:
+        """The velocities of `frame` in `reference` at many stamps, as `twist` gives them at one.
+
+        Parameters
+        ----------
+        frame, reference, expressed_in : str
+            As `twist`.
+        stamps : integer array of shape (n,)
+            ns, in any order.
+        out_of_range : {"raise", "nan"}
+            As for `lookup_many`.
+
+        Raises
+        ------
+        TransformLookupError
+            As `twist`; `index` says at which stamp. With ``"nan"``, only if there is no path at all stamps.
+        TypeError, ValueError
+            As for `lookup_many`.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> outcomes = tree.insert_columns("map", "base_link", [0, SECOND], [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]],
+        ...                                [[0.0, 0.0, 0.0, 1.0]] * 2)
+        >>> tree.twist_many("base_link", "map", [0, SECOND // 2]).linear
+        array([[2., 0., 0.],
+               [2., 0., 0.]])
+        """
+        axes = reference if expressed_in is None else expressed_in
+        asked = locked(as_stamps(stamps).copy())
+        self._forest.search(reference, frame)
+        self._forest.search(axes, reference)
+        found = locked(twist_many(self._forest, frame, reference, asked, axes, out_of_range))
+        return TwistArray(axes, asked, found[:3].T, found[3:].T)
+
     def latest_common_stamp(self, target: str, source: str) -> int | None:
         """The stamp that `LATEST` means for two frames, in ns; None if the whole path is static.
 
@@ -568,6 +621,101 @@ class TransformTree:
         before = [sample for sample in found if sample.static or sample.stamp <= stamp]
         after = [sample for sample in found if sample.static or sample.stamp >= stamp]
         return (before[-1] if before else None), (after[0] if after else None)
+
+    def samples(self, frame: str, start: StampLike | None = None, stop: StampLike | None = None) -> TransformArray:
+        """The samples of a frame in its parent, as they were sent, at their own stamps.
+
+        Parameters
+        ----------
+        frame : str
+        start, stop : int, optional
+            The first and the last stamp, in ns, both included; by default all in the window.
+
+        Returns
+        -------
+        TransformArray
+            In the order of the stamps. A static frame has one sample, at any `start` and `stop`; a root has none.
+
+        Raises
+        ------
+        UnknownFrameError
+        ValueError
+            If the samples name several parents. The message has the stamps at which the parent changes, as bounds for
+            `start` and `stop`.
+        TypeError, ValueError
+            If a bound is not a stamp.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> outcomes = tree.insert_columns("map", "base_link", [0, 100], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]],
+        ...                                [[0.0, 0.0, 0.0, 1.0]] * 2)
+        >>> tree.samples("base_link", start=50).stamps
+        array([100])
+        """
+        low, high = _bounds(start, stop)
+        with self._forest.lock:
+            self._forest.check_known(frame)
+            history = self._forest.frames.get(frame)
+            if history is not None and history.static:
+                return from_columns(np.array([history.static_row]).T, stamps=np.array([history.static_stamp or 0]))
+            samples = None if history is None else history.samples_between(low, high)
+        if samples is None:
+            return from_columns(np.empty((7, 0)), stamps=np.empty(0, np.int64))
+        here = (low <= samples.stamps) & (samples.stamps <= high)
+        if samples.parents is not None:
+            named = [parent for parent, kept in zip(samples.parents, here.tolist(), strict=True) if kept]
+            stamps = samples.stamps[here]
+            changes = [i for i in range(1, len(named)) if named[i] != named[i - 1]]
+            if changes:
+                where = "; ".join(f"{named[i]!r} from {format_stamp(int(stamps[i]))}" for i in changes[:_SHOWN])
+                raise ValueError(
+                    f"frame {frame!r} has samples in several parents: {named[0]!r} first, {where}: give start and stop "
+                    "between two changes"
+                )
+        return from_columns(np.ascontiguousarray(samples.rows[here].T), stamps=samples.stamps[here])
+
+    def stamps(self, target: str, source: str, start: StampLike | None = None, stop: StampLike | None = None) -> Stamps:
+        """The stamps at which the way between two frames was recorded, for `lookup_many` and `twist_many`.
+
+        Parameters
+        ----------
+        target, source : str
+        start, stop : int, optional
+            The first and the last stamp, in ns, both included.
+
+        Returns
+        -------
+        integer array of shape (n,)
+            In ns, ascending: the stamps of the moving edge with the most samples on the newest path, as far as all
+            moving edges on it have data. None of an all-static path.
+
+        Raises
+        ------
+        UnknownFrameError, DisconnectedError
+        TypeError, ValueError
+            If a bound is not a stamp.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> for stamp in (0, 100):
+        ...     outcome = tree.insert(TransformStamped("map", "base_link", stamp, Transform()))
+        >>> tree.stamps("base_link", "map")
+        array([  0, 100])
+        """
+        low, high = _bounds(start, stop)
+        edges = moving_edges(self, target, source)
+        oldest = [edge.oldest for edge in edges if edge.oldest is not None]
+        newest = [edge.newest for edge in edges if edge.newest is not None]
+        if not edges or len(oldest) < len(edges):
+            return np.empty(0, np.int64)
+        low, high = max(low, *oldest), min(high, *newest)
+        densest = max(edges, key=lambda edge: edge.samples)
+        with self._forest.lock:
+            samples = self._forest.frames[densest.child].samples_between(low, high)
+        stamps = samples.stamps
+        return stamps[(low <= stamps) & (stamps <= high)]
 
     def edges(self) -> list[Edge]:
         """Every frame that has a parent, with its newest edge, sorted by name."""
@@ -680,6 +828,12 @@ def tree_of(forest: Forest, keep: float | None, max_translation: float = MAX_TRA
     return tree
 
 
+def moving_edges(tree: TransformTree, target: str, source: str) -> list[Edge]:
+    """The moving edges on the newest path between two frames; raises as `TransformTree.chain`."""
+    frames = set(tree.chain(target, source))
+    return [edge for edge in tree.edges() if not edge.static and {edge.parent, edge.child} <= frames]
+
+
 def forest_of(tree: TransformTree) -> Forest:
     """The forest behind a tree."""
     return tree._forest
@@ -699,6 +853,14 @@ def window_of(keep: float | None) -> int | None:
     if seconds > STAMP_MAX / SECOND:
         raise ValueError(f"keep must be at most 292 years, in s, got {keep!r}: nanoseconds passed as seconds?")
     return from_seconds(seconds)
+
+
+_SHOWN = 5
+
+
+def _bounds(start: StampLike | None, stop: StampLike | None) -> tuple[int, int]:
+    """The first and the last stamp, in ns; None is no bound."""
+    return STAMP_MIN if start is None else as_stamp(start), STAMP_MAX if stop is None else as_stamp(stop)
 
 
 def _as_many(source_at: StampLike | StampsLike, count: int) -> Stamps:

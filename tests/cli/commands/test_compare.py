@@ -50,9 +50,38 @@ def test_without_a_pair_all_frames_that_move_in_both_are_compared(
 def test_errors_over_time_are_a_table(both: tuple[Path, Path], tfbus: Command) -> None:
     done = tfbus("compare", *both, "--pair", "map:base", "--delta", "3", "--csv")
     rows = list(csv.DictReader(StringIO(done.stdout)))
-    assert [row["stamp"] for row in rows] == [f"{k}.000000000" for k in range(10)]
-    assert [float(row["absolute_translation"]) for row in rows] == [2.0] * 10
-    assert [bool(row["relative_translation"]) for row in rows] == [k in (3, 6, 9) for k in range(10)]
+    assert [int(row["stamp_ns"]) for row in rows] == [k * SECOND for k in range(10)]
+    assert [float(row["absolute_translation_m"]) for row in rows] == [2.0] * 10
+    assert [bool(row["relative_translation_m"]) for row in rows] == [k in (3, 6, 9) for k in range(10)]
+
+
+def test_a_trajectory_of_tum_is_compared_with_a_recording_of_other_names(
+    both: tuple[Path, Path], tmp_path: Path, tfbus: Command
+) -> None:
+    tum = tmp_path / "truth.tum"
+    tum.write_text("".join(f"{k}.0 {k} {0.1 * k * k} 0 0 0 0 1\n" for k in range(10)))
+    wanted = tfbus("compare", *both, "--pair", "map:base", "--json")
+    done = tfbus("compare", tum, both[1], "--pair", "map:base_link=map:base", "--json")
+    assert json.loads(done.stdout.replace("map:base_link=", "")) == json.loads(wanted.stdout)
+    check_wrong_call(tfbus("compare", tum, both[1]), "--pair TARGET:SOURCE=TARGET:SOURCE")
+    for wrong in ("map", "map:base=", "map:base=map", "map=base:map", ":base", "map:base=a:b=c:d"):
+        check_wrong_call(tfbus("compare", *both, "--pair", wrong), "a pair is TARGET:SOURCE")
+
+
+def test_the_errors_are_drawn_with_the_names_of_the_files(
+    both: tuple[Path, Path], tmp_path: Path, tfbus: Command
+) -> None:
+    pytest.importorskip("matplotlib")
+    (tmp_path / "monday").mkdir()
+    same = write(tmp_path / "monday" / "truth.mcap", 0.5)
+    picture = tmp_path / "errors.svg"
+    for other, name in ((both[1], "slam against truth"), (same, f"monday/truth against {tmp_path.name}/truth")):
+        done = tfbus("compare", both[0], other, "--plot", picture)
+        assert (done.returncode, done.stderr) == (0, f"wrote {picture}\n")
+        assert f"<!-- map:base: {name}, aligned -->" in picture.read_text(encoding="utf-8")
+    check_wrong_call(tfbus("compare", *both, "--plot", tmp_path / "errors.gif"), ".png, .svg or .pdf")
+    two = ("--pair", "map:base", "--pair", "base:map", "--plot", picture)
+    check_wrong_call(tfbus("compare", *both, *two), "--plot draws one pair")
 
 
 def test_what_cannot_be_aligned_is_warned_of(tmp_path: Path, tfbus: Command) -> None:

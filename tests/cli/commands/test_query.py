@@ -35,7 +35,7 @@ def recording(tmp_path: Path) -> Path:
 def test_by_default_it_prints_the_newest_transform(recording: Path, tfbus: Command) -> None:
     done = tfbus("query", recording, "map", "arm", "--csv")
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == "stamp,x,y,z,qx,qy,qz,qw\n1700000007.373456789,7.75,0.0,0.0,0.0,0.0,0.0,1.0\n"
+    assert done.stdout == "stamp_ns,x_m,y_m,z_m,qx,qy,qz,qw\n1700000007373456789,7.75,0.0,0.0,0.0,0.0,0.0,1.0\n"
 
 
 def test_an_instant_is_exact_to_the_nanosecond(recording: Path, tfbus: Command) -> None:
@@ -57,10 +57,8 @@ def test_intervals_span_the_time_that_all_edges_cover(recording: Path, tfbus: Co
     done = tfbus("query", recording, "map", "arm", "--every", "0.5", "--csv")
     assert (done.returncode, done.stderr) == (0, "")
     rows = list(csv.DictReader(StringIO(done.stdout)))
-    assert [row["stamp"] for row in rows] == [
-        f"{1_700_000_002 + (k * 500 + 623) // 1_000}.{(k * 500 + 623) % 1_000}456789" for k in range(10)
-    ]
-    assert [float(row["x"]) for row in rows] == pytest.approx([3.0 + k * 0.5 for k in range(10)])
+    assert [int(row["stamp_ns"]) for row in rows] == [EPOCH + (5 + k) * SECOND // 2 for k in range(10)]
+    assert [float(row["x_m"]) for row in rows] == pytest.approx([3.0 + k * 0.5 for k in range(10)])
 
 
 def test_the_rows_are_those_of_single_lookups(tfbus: Command) -> None:
@@ -69,9 +67,8 @@ def test_the_rows_are_those_of_single_lookups(tfbus: Command) -> None:
     rows = list(csv.DictReader(StringIO(done.stdout)))
     assert len(rows) > 900
     for row in rows:
-        seconds, _, rest = row["stamp"].partition(".")
-        found = tree.lookup("laser", "box", int(seconds + rest)).transform
-        assert [float(row[name]) for name in ("x", "y", "z")] == pytest.approx(found.translation, abs=1e-12)
+        found = tree.lookup("laser", "box", int(row["stamp_ns"])).transform
+        assert [float(row[name]) for name in ("x_m", "y_m", "z_m")] == pytest.approx(found.translation, abs=1e-12)
         assert [float(row[name]) for name in ("qx", "qy", "qz", "qw")] == pytest.approx(found.rotation, abs=1e-12)
 
 
@@ -106,7 +103,7 @@ def test_instants_at_which_the_frames_are_not_connected_are_left_out_and_counted
         for k in range(11)
     ]
     done = tfbus("query", write_mcap(tmp_path / "run.mcap", lines), "robot", "box", "--every", every, "--csv")
-    stamps = [float(line.partition(",")[0]) for line in done.stdout.splitlines()[1:]]
+    stamps = [int(line.partition(",")[0]) / SECOND for line in done.stdout.splitlines()[1:]]
     assert (done.returncode, len(stamps)) == (0, rows)
     assert not [stamp for stamp in stamps if 3.0 < stamp < 7.0 and every == "1"]
     assert done.stderr == f"tfbus: {left_out} instants are left out, the frames are not connected there\n"
@@ -173,12 +170,23 @@ def test_the_format_of_tum_has_eight_numbers_a_line(recording: Path, tfbus: Comm
     ]
 
 
+def test_the_formats_of_kitti_and_euroc_have_a_matrix_or_the_stamp_in_ns_a_line(
+    recording: Path, tfbus: Command
+) -> None:
+    question = ("query", recording, "map", "base", "--every", "5")
+    kitti = tfbus(*question, "--kitti").stdout.splitlines()
+    assert kitti == [f"1.0 0.0 0.0 {5.0 * k} 0.0 1.0 0.0 0.0 0.0 0.0 1.0 0.0" for k in range(3)]
+    header, *euroc = tfbus(*question, "--euroc").stdout.splitlines()
+    assert header.startswith("#timestamp [ns],")
+    assert euroc == [f"{EPOCH + 5 * k * SECOND},{5.0 * k},0.0,0.0,1.0,0.0,0.0,0.0" for k in range(3)]
+
+
 def test_several_pairs_are_told_apart(recording: Path, tfbus: Command) -> None:
     done = tfbus("query", recording, "map", "base", "base", "laser", "--csv")
     assert done.stdout.splitlines() == [
-        "target,source,stamp,x,y,z,qx,qy,qz,qw",
-        "map,base,1700000010.123456789,10.0,0.0,0.0,0.0,0.0,0.0,1.0",
-        "base,laser,0.000000000,100.0,0.0,0.0,0.0,0.0,0.0,1.0",
+        "target,source,stamp_ns,x_m,y_m,z_m,qx,qy,qz,qw",
+        "map,base,1700000010123456789,10.0,0.0,0.0,0.0,0.0,0.0,1.0",
+        "base,laser,0,100.0,0.0,0.0,0.0,0.0,0.0,1.0",
     ]
     table = tfbus("query", recording, "map", "base", "base", "laser").stdout.splitlines()
     assert [table[at] for at in (0, 3, 4)] == ["base in map", "", "laser in base"]
@@ -190,13 +198,13 @@ def test_parquet_has_a_row_for_each_transform(recording: Path, tmp_path: Path, t
     done = tfbus("query", recording, "map", "base", "base", "laser", "--every", "5", "--parquet", path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", f"4 rows in {path}\n")
     rows = parquet.read_table(path).to_pylist()
-    assert [(row["target"], row["source"], row["x"], row["qw"]) for row in rows] == [
+    assert [(row["target"], row["source"], row["x_m"], row["qw"]) for row in rows] == [
         ("map", "base", 0.0, 1.0),
         ("map", "base", 5.0, 1.0),
         ("map", "base", 10.0, 1.0),
         ("base", "laser", 100.0, 1.0),
     ]
-    assert rows[1]["stamp"] == EPOCH + 5 * SECOND
+    assert rows[1]["stamp_ns"] == EPOCH + 5 * SECOND
     check_wrong_call(tfbus("query", recording, "map", "base", "--parquet", tmp_path / "no" / "x"), "cannot write")
     assert not (tmp_path / "no").exists()
 
@@ -219,7 +227,17 @@ def test_messages_without_a_readable_header_are_counted(tmp_path: Path, tfbus: C
     done = tfbus("query", tmp_path, "map", "base", "--stamps-of", "/image", "--csv")
     assert done.stderr.splitlines() == ["tfbus: 1 message on /image cannot be read"]
     (row,) = csv.DictReader(StringIO(done.stdout))
-    assert (row["stamp"], float(row["x"])) == ("0.000000005", 5.0)
+    assert (row["stamp_ns"], float(row["x_m"])) == ("5", 5.0)
+
+
+def test_own_stamps_are_those_of_the_frame_with_the_most_samples_as_far_as_all_have_data(
+    recording: Path, tfbus: Command
+) -> None:
+    for pair, first, count in ((("map", "base"), 0, 101), (("map", "arm"), 5 * SECOND // 2, 476)):
+        rows = list(csv.DictReader(StringIO(tfbus("query", recording, *pair, "--own-stamps", "--csv").stdout)))
+        assert (len(rows), int(rows[0]["stamp_ns"])) == (count, EPOCH + first)
+    assert len(tfbus("query", recording, "base", "laser", "--own-stamps", "--csv").stdout.splitlines()) == 2
+    check_wrong_call(tfbus("query", recording, "map", "base", "--own-stamps", "--at", "1"), "give one of them")
 
 
 def test_namespaces_are_read_and_ignored_ones_are_mentioned(tmp_path: Path, tfbus: Command) -> None:
@@ -244,7 +262,7 @@ def test_a_speed_limit_leaves_out_what_cannot_be(tmp_path: Path, tfbus: Command)
 def test_where_a_line_does_not_fit_the_quaternion_is_on_a_second_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    row = Row("map", "base", 1_396_293_888_050_000_001, [1e12, -2.0, 0.5], [0.0, 0.0, 0.0, 1.0])
+    row = Row("map", "base", 1_396_293_888_050_000_001, (1e12, -2.0, 0.5), (0.0, 0.0, 0.0, 1.0))
     heights = {}
     for width in (60, 103, 104):
         monkeypatch.setenv("COLUMNS", str(width))

@@ -39,9 +39,10 @@ def convert(
     Parameters
     ----------
     source
-        A recording: .mcap, .db3 or .bag, or a folder of ROS 2.
+        A recording: .mcap, .db3 or .bag, a folder of ROS 2, or a trajectory of TUM, KITTI or EuRoC.
     further
-        More recordings, and at last the new file: .mcap, .bag (ROS 1) or .db3 (ROS 2).
+        More recordings, and at last the new file: .mcap, .bag (ROS 1) or .db3 (ROS 2); for the trajectory of one frame
+        .tum, .kitti or .euroc.
     since
         The start: seconds from the beginning of the first recording, a stamp in seconds, or a date. The static
         transforms from before come first.

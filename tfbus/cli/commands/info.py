@@ -11,7 +11,6 @@ from tfbus.cli.arguments import Flag, JsonFlag
 from tfbus.cli.output import (
     Column,
     format_counts,
-    format_seconds,
     format_span,
     progress,
     table_lines,
@@ -21,7 +20,7 @@ from tfbus.cli.output import (
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions
 from tfbus.recording.recording import RecordedTopic
 from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, Spread, summarise
-from tfbus.stamps import SECOND
+from tfbus.stamps import SECOND, format_seconds
 
 _SPREADS = tuple(
     Column(f"{what} {value}", right=True) for what in ("period", "delay") for value in ("mean", "p99", "max")
@@ -58,7 +57,7 @@ def info(
     Parameters
     ----------
     file
-        A recording: .mcap, .db3 or .bag, or a folder of ROS 2.
+        A recording: .mcap, .db3 or .bag, a folder of ROS 2, or a trajectory of TUM, KITTI or EuRoC.
     as_json
         Print a JSON object instead of tables, with times in s and instants as text with all digits.
     wide

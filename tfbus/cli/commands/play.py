@@ -61,7 +61,7 @@ def play(
     Parameters
     ----------
     file
-        A recording: .mcap, .db3 or .bag, or a folder of ROS 2.
+        A recording: .mcap, .db3 or .bag, a folder of ROS 2, or a trajectory of TUM, KITTI or EuRoC.
     rate
         How many times as fast as it was recorded; inf for as fast as possible.
     loop

@@ -37,7 +37,7 @@ def plot(
     Parameters
     ----------
     file
-        A recording: .mcap, .db3 or .bag, or a folder of ROS 2.
+        A recording: .mcap, .db3 or .bag, a folder of ROS 2, or a trajectory of TUM, KITTI or EuRoC.
     frames
         The target, then the sources. With --gaps, the frames to show; by default all.
     output
@@ -59,13 +59,8 @@ def plot(
         raise UsageError("--text prints the curves over time: give no --path, --3d or --output with it")
     if not gaps and len(frames) < 2:
         raise UsageError("give the target and at least one source, such as: tfbus plot run.mcap map base_link")
-    kind = None if output is None else output.suffix.removeprefix(".").lower()
-    if kind is not None and kind not in _KINDS:
-        raise UsageError(f"cannot draw {output}: its name must end in .png, .svg or .pdf")
-    try:
-        from tfbus import plot as plots
-    except ImportError as error:
-        raise UsageError(str(error)) from None
+    kind = None if output is None else picture_kind(output)
+    plots = _plots()
     if gaps:
         problems = Problems()
         with open_recording(file) as recording:
@@ -79,12 +74,12 @@ def plot(
         if not reception:
             raise UsageError(f"there are no transforms in {file}")
         chosen = {frame: reception[frame] for frame in frames} if frames else reception
-        _finish(lambda figure: plots.plot_gaps(chosen, figure), output, kind)
+        draw_picture(lambda plots, figure: plots.plot_gaps(chosen, figure, recording=file.name), output, kind)
         return
     target, *sources = frames
     trees = [("", load_tree(file)[0])]
     if compare is not None:
-        names = (file.stem, compare.stem) if file.stem != compare.stem else (str(file), str(compare))
+        names = distinct_names(file, compare)
         trees = [(names[0], trees[0][1]), (names[1], load_tree(compare)[0])]
     if text:
         for name, tree in trees:
@@ -92,23 +87,64 @@ def plot(
                 if name:
                     print(printable(name))
                 print(plots.sparklines(plots.read_series(tree, target, source)))
-    elif path or three_d:
-        _finish(lambda figure: plots.plot_path(trees, target, *sources, three_d=three_d, figure=figure), output, kind)
     else:
-        _finish(lambda figure: plots.plot_transforms(trees, target, *sources, figure=figure), output, kind)
+        named = file.name if compare is None else ""
+
+        def draw(plots: Any, figure: Any) -> Any:
+            if path or three_d:
+                return plots.plot_path(trees, target, *sources, three_d=three_d, recording=named, figure=figure)
+            return plots.plot_transforms(trees, target, *sources, recording=named, figure=figure)
+
+        draw_picture(draw, output, kind)
 
 
-def _finish(draw: Callable[[Any], Any], output: Path | None, kind: str | None) -> None:
-    """Write a figure to a file, or show it in a window until that is closed."""
+def distinct_names(first: Path, second: Path) -> tuple[str, str]:
+    """Short names that tell two files apart: without their ending, and with as many folders as it takes."""
+    names = [[*path.parts[:-1], path.stem] for path in (first, second)]
+    if first.stem == second.stem and first.suffix != second.suffix:
+        return first.name, second.name
+    for count in range(1, max(map(len, names)) + 1):
+        one, other = ("/".join(parts[-count:]) for parts in names)
+        if one != other:
+            return one, other
+    return str(first), f"{second} again"
+
+
+def picture_kind(output: Path) -> str:
+    """The format of a picture by the name of its file; raises `UsageError` for another ending."""
+    kind = output.suffix.removeprefix(".").lower()
+    if kind not in _KINDS:
+        raise UsageError(f"cannot draw {output}: its name must end in .png, .svg or .pdf")
+    return kind
+
+
+def _plots() -> Any:
+    try:
+        from tfbus import plot
+    except ImportError as error:
+        raise UsageError(str(error)) from None
+    return plot
+
+
+def draw_picture(draw: Callable[[Any, Any], Any], output: Path | None, kind: str | None) -> None:
+    """Write a figure to a file, or show it in a window until that is closed.
+
+    Parameters
+    ----------
+    draw : callable
+        Draws with the module `tfbus.plot` into a figure, or a new one for None; returns the figure.
+    output : Path, optional
+    kind : str, optional
+        Of `picture_kind`.
+    """
+    plots = _plots()
     if output is not None:
         picture = BytesIO()
-        draw(None).savefig(picture, format=kind, dpi=150)
+        draw(plots, None).savefig(picture, format=kind, dpi=150)
         write_file(output, picture.getvalue())
         say(f"wrote {output}")
         return
-    from tfbus.plot import show_in_window
-
     try:
-        show_in_window(draw)
+        plots.show_in_window(lambda figure: draw(plots, figure))
     except RuntimeError as error:
         raise UsageError(f"{error}: write a picture with -o, or print the curves with --text") from None

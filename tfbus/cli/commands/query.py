@@ -19,20 +19,22 @@ from tfbus.cli.arguments import (
     Step,
     UsageError,
 )
-from tfbus.cli.output import csv_name, csv_writer, format_seconds, say, terminal_width, track, warn, wrapped
+from tfbus.cli.output import csv_name, csv_writer, say, terminal_width, track, warn, wrapped
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions, load_tree
 from tfbus.errors import DisconnectedError, pip_install
+from tfbus.geometry.transform_array import COLUMN_NAMES
+from tfbus.recording.formats import trajectories
 from tfbus.recording.header_stamps import header_stamps
-from tfbus.stamps import LATEST, to_seconds
-from tfbus.tree.tree import TransformTree
+from tfbus.rows import Quaternion, Vector
+from tfbus.stamps import LATEST, format_seconds, to_seconds
+from tfbus.tree.tree import TransformTree, moving_edges
 
 MAX_ROWS = 10_000_000
 _CHUNK = 4_096
-Format = Literal["table", "csv", "json", "tum"]
+Format = Literal["table", "csv", "json", "tum", "kitti", "euroc"]
 _BLOCK = 65_536
 _STAMP, _NUMBER = 20, 12
 """The widths of a stamp and of a number in a table."""
-_NUMBERS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 class Row(NamedTuple):
@@ -41,8 +43,8 @@ class Row(NamedTuple):
     target: str
     source: str
     stamp: int
-    translation: list[float]
-    rotation: list[float]
+    translation: Vector
+    rotation: Quaternion
 
 
 def query(
@@ -54,24 +56,27 @@ def query(
     at: Instant | None = None,
     every: Step | None = None,
     stamps_of: str | None = None,
+    own_stamps: Flag = False,
     as_csv: CsvFlag = False,
     as_json: JsonFlag = False,
     tum: Flag = False,
+    kitti: Flag = False,
+    euroc: Flag = False,
     parquet: Path | None = None,
     max_speed: Positive | None = None,
     topics: TopicOptions = DEFAULT_TOPICS,
 ) -> None:
     """Print the transform of SOURCE in TARGET from a recording: the newest, at an instant, or at many.
 
-    Instants are exact to the nanosecond. Translations are in m, rotations are unit quaternions x y z w. With --every
-    and --stamps-of, instants without an answer are left out, and standard error says how many.
+    Instants are exact to the nanosecond. Translations are in m, rotations are unit quaternions x y z w. With --every,
+    --own-stamps and --stamps-of, instants without an answer are left out, and standard error says how many.
 
     Example: tfbus query run.mcap map base_link --every 0.1 --csv
 
     Parameters
     ----------
     file
-        A recording: .mcap, .db3 or .bag, or a folder of ROS 2.
+        A recording: .mcap, .db3 or .bag, a folder of ROS 2, or a trajectory of TUM, KITTI or EuRoC.
     target
         The frame in which the transform is expressed.
     source
@@ -86,32 +91,41 @@ def query(
         The interval in s; the first and the last instant are those for which all frames between the two have data.
     stamps_of
         Take the instants from the headers of the messages on this topic.
+    own_stamps
+        Take the instants at which the frame between the two with the most samples was recorded.
     as_csv
-        Print comma-separated values with a header.
+        Print comma-separated values with a header; stamps in ns, the names as in a data frame of TransformArray.
     as_json
         Print one JSON object a line.
     tum
         Print lines of stamp x y z qx qy qz qw, the format of TUM's trajectories.
+    kitti
+        Print the upper three rows of each matrix, the format of KITTI's trajectories, which has no stamps.
+    euroc
+        Print lines of stamp,x,y,z,qw,qx,qy,qz, the format of EuRoC's trajectories, with stamps in ns.
     parquet
         Write a Parquet file instead.
     max_speed
         Leave out transforms that a frame can only have reached at a higher speed than this, in m/s.
     """
     pairs = _pairs(target, source, further)
-    given: dict[Format, bool] = {"csv": as_csv, "json": as_json, "tum": tum}
+    given: dict[Format, bool] = {"csv": as_csv, "json": as_json, "tum": tum, "kitti": kitti, "euroc": euroc}
     kinds = [kind for kind, wanted in given.items() if wanted]
     if len(kinds) + (parquet is not None) > 1:
-        raise UsageError("--csv, --json, --tum and --parquet are ways to write the same: give one of them")
-    if sum(each is not None for each in (at, every, stamps_of)) > 1:
-        raise UsageError("--at, --every and --stamps-of are different questions: give one of them")
-    if tum and len(pairs) > 1:
-        raise UsageError("--tum has no names of frames: ask for one pair")
+        ways = ", ".join(f"--{name}" for name in given)
+        raise UsageError(f"{ways} and --parquet are ways to write the same: give one of them")
+    if sum(each is not None for each in (at, every, stamps_of)) + own_stamps > 1:
+        raise UsageError("--at, --every, --own-stamps and --stamps-of are different questions: give one of them")
+    if kinds and kinds[0] in _TRAJECTORIES and len(pairs) > 1:
+        raise UsageError(f"--{kinds[0]} has no names of frames: ask for one pair")
     tree, start = load_tree(file, topics, max_speed)
     stamps = None if stamps_of is None else _stamps_of(file, stamps_of)
 
     def rows() -> Iterator[Row]:
         for pair in pairs:
-            if every is not None:
+            if own_stamps and len(own := tree.stamps(*pair)):
+                yield from _rows_at(tree, *pair, own)
+            elif every is not None:
                 yield from _rows_at_intervals(tree, *pair, every)
             elif stamps is not None:
                 yield from _rows_at(tree, *pair, stamps)
@@ -143,13 +157,12 @@ def _stamps_of(file: Path, topic: str) -> npt.NDArray[np.int64]:
 def _one_row(tree: TransformTree, target: str, source: str, at: int | None) -> Iterator[Row]:
     """The transform at a stamp, or the newest one."""
     found = tree.lookup(target, source, LATEST if at is None else at)
-    yield Row(target, source, found.stamp, [*found.transform.translation], [*found.transform.rotation])
+    yield Row(target, source, found.stamp, found.transform.translation, found.transform.rotation)
 
 
 def _rows_at_intervals(tree: TransformTree, target: str, source: str, step: int) -> Iterator[Row]:
     """The transforms every `step` ns over the span that all moving edges between the two frames cover."""
-    frames = set(tree.chain(target, source))
-    edges = [edge for edge in tree.edges() if not edge.static and {edge.parent, edge.child} <= frames]
+    edges = moving_edges(tree, target, source)
     starts = [edge.oldest for edge in edges if edge.oldest is not None]
     ends = [edge.newest for edge in edges if edge.newest is not None]
     if not starts:
@@ -184,7 +197,7 @@ def _rows_at(
         missing += int(np.count_nonzero(~valid))
         columns = (part[valid], found.translations[valid], found.rotations[valid])
         for stamp, translation, rotation in zip(*(column.tolist() for column in columns), strict=True):
-            yield Row(target, source, stamp, translation, rotation)
+            yield Row(target, source, stamp, tuple(translation), tuple(rotation))
     if missing == count:
         # This lookup raises the error that says why.
         yield from _one_row(tree, target, source, int(stamps[0]) if fallback is None else fallback)
@@ -201,7 +214,7 @@ def print_rows(rows: Iterable[Row], kind: Format, several: bool) -> None:
 
 
 def write_parquet(rows: Iterator[Row], path: Path) -> None:
-    """Write rows to a Parquet file with the columns target, source, stamp (int64, ns), x, y, z, qx, qy, qz and qw.
+    """Write rows to a Parquet file with the columns target, source, stamp_ns, and those of `COLUMN_NAMES`.
 
     Raises
     ------
@@ -214,8 +227,8 @@ def write_parquet(rows: Iterator[Row], path: Path) -> None:
     except ImportError:
         raise UsageError(f"--parquet needs one more package: {pip_install('parquet')}") from None
     names = pa.dictionary(pa.int32(), pa.string())
-    fields = [("target", names), ("source", names), ("stamp", pa.int64())]
-    schema = pa.schema(fields + [(name, pa.float64()) for name in _NUMBERS])
+    fields = [("target", names), ("source", names), ("stamp_ns", pa.int64())]
+    schema = pa.schema(fields + [(name, pa.float64()) for name in COLUMN_NAMES])
     # A lookup that fails writes nothing.
     rows = iter(rows)
     first = list(islice(rows, _BLOCK))
@@ -241,10 +254,10 @@ def write_parquet(rows: Iterator[Row], path: Path) -> None:
 
 def _print_csv(rows: Iterator[Row], several: bool) -> None:
     out = csv_writer()
-    out.writerow((*(("target", "source") if several else ()), "stamp", *_NUMBERS))
+    out.writerow((*(("target", "source") if several else ()), "stamp_ns", *COLUMN_NAMES))
     for row in rows:
         pair = (csv_name(row.target), csv_name(row.source)) if several else ()
-        out.writerow((*pair, format_seconds(row.stamp), *row.translation, *row.rotation))
+        out.writerow((*pair, row.stamp, *row.translation, *row.rotation))
 
 
 def _print_json(rows: Iterator[Row], _: bool) -> None:
@@ -252,22 +265,25 @@ def _print_json(rows: Iterator[Row], _: bool) -> None:
         print(json.dumps({**row._asdict(), "stamp": format_seconds(row.stamp)}))
 
 
-def _print_tum(rows: Iterator[Row], _: bool) -> None:
-    for row in rows:
-        print(format_seconds(row.stamp), *row.translation, *row.rotation)
+def _print_trajectory(kind: trajectories.Format) -> Callable[[Iterator[Row], bool], None]:
+    def print_lines(rows: Iterator[Row], _: bool) -> None:
+        for line in trajectories.lines_of(((row.stamp, (*row.translation, *row.rotation)) for row in rows), kind):
+            print(line)
+
+    return print_lines
 
 
 def _print_table(rows: Iterator[Row], several: bool) -> None:
     """Print a line a row, or two lines where the terminal is too narrow for the numbers of one."""
     width = terminal_width()
-    between = "" if width is None or width >= _STAMP + _NUMBER * len(_NUMBERS) else "\n" + " " * (_STAMP - _NUMBER)
+    between = "" if width is None or width >= _STAMP + _NUMBER * len(COLUMN_NAMES) else "\n" + " " * (_STAMP - _NUMBER)
     pair = None
     for row in rows:
         if pair != row[:2]:
             if several:
                 heading = f"{row.source} in {row.target}"
                 print(*([] if pair is None else [""]), *wrapped(heading, width, 2), sep="\n")
-            titles = [f"{name:>{_NUMBER}}" for name in ("x [m]", "y [m]", "z [m]", *_NUMBERS[3:])]
+            titles = [f"{name:>{_NUMBER}}" for name in ("x [m]", "y [m]", "z [m]", *COLUMN_NAMES[3:])]
             print(f"{'stamp [s]':>{_STAMP}}{''.join(titles[:3])}{between}{''.join(titles[3:])}")
             pair = row[:2]
         values = [_number(value) for value in (*row.translation, *row.rotation)]
@@ -279,9 +295,14 @@ def _number(value: float) -> str:
     return text if len(text) <= _NUMBER else f" {value:{_NUMBER - 1}.4e}"
 
 
+_TRAJECTORIES: dict[Format, trajectories.Format] = {
+    "tum": trajectories.TUM,
+    "kitti": trajectories.KITTI,
+    "euroc": trajectories.EUROC,
+}
 _PRINTERS: dict[Format, Callable[[Iterator[Row], bool], None]] = {
     "table": _print_table,
     "csv": _print_csv,
     "json": _print_json,
-    "tum": _print_tum,
+    **{name: _print_trajectory(kind) for name, kind in _TRAJECTORIES.items()},
 }

@@ -16,13 +16,13 @@ from tfbus.bus.broadcaster import TransformBroadcaster
 from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Backend, Duration, Flag, Rate
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, ReplayClock, run
-from tfbus.cli.output import fitted, format_seconds, print_now, say
+from tfbus.cli.output import fitted, print_now, say
 from tfbus.clock import Clock, SimulatedClock, SystemClock
 from tfbus.data import PointStamped
 from tfbus.errors import TransformError
 from tfbus.geometry.transform import Transform
 from tfbus.rows import Vector
-from tfbus.stamps import LATEST, to_seconds
+from tfbus.stamps import LATEST, format_seconds, to_seconds
 
 BASE, LASER = "base_link", "base_laser"
 BASE_FROM_LASER = Transform((0.1, 0.0, 0.2))
