@@ -25,7 +25,10 @@ from tfbus.recording import load
 def scans_in(path: Path, topic: str, target: str) -> Iterator[tfbus.PointCloud]:
     tree = load(path)
     with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
-        for connection, _, message in bag.messages([each for each in bag.connections if each.topic == topic]):
+        scans = [each for each in bag.connections if each.topic == topic]
+        if not scans:  # rosbags would read every topic
+            raise SystemExit(f"no topic {topic!r} in {sorted(bag.topics)}")
+        for connection, _, message in bag.messages(scans):
             cloud = from_message(bag.deserialize(message, connection.msgtype)).to_points()
             try:
                 yield tree.deskew(cloud, target, fixed=target)
@@ -66,6 +69,8 @@ def record(path: Path) -> None:
 
 def main(path: Path, topic: str = "/scan", target: str = "map") -> None:
     clouds = list(scans_in(path, topic, target))
+    if not clouds:
+        raise SystemExit(f"no scan of {topic!r} could be put into {target!r}")
     points = np.concatenate([cloud.points for cloud in clouds])
     print(f"{len(clouds)} scans, {len(points)} points in {target!r}: x from {points[:, 0].min():.3f} m", end=" ")
     print(f"to {points[:, 0].max():.3f} m")

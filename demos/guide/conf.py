@@ -216,11 +216,11 @@ def summaries() -> str:
         text = (GUIDE / "reference" / f"{page}.rst").read_text()
         title = text.partition("\n")[0]
         lines = []
-        for kind, name in re.findall(r"^\.\. auto(\w+):: (tfbus[\w.]+)", text, re.MULTILINE):
-            # The docstring of data is the one of their type.
-            summary = "" if kind == "data" else (inspect.getdoc(find(name)) or "").partition("\n\n")[0]
+        for name, written in re.findall(r"^\.\. (?:auto\w+|data):: ([\w.]+).*\n(?:\n   (\w.*))?", text, re.MULTILINE):
+            name = name if "." in name else f"tfbus.{name}"
+            summary = written or (inspect.getdoc(find(name)) or "").partition("\n\n")[0]
             summary = re.sub(r"(?<!`)`([^`]+)`(?!`)", r"``\1``", " ".join(summary.split()))
-            lines.append(f"* :obj:`{name}`" + (f": {summary}" if summary else ""))
+            lines.append(f"* :obj:`{name}`: {summary}")
         title = f":doc:`{title} <{page}>`"
         parts.append(f"{title}\n{'-' * len(title)}\n\n" + "\n".join(lines) + "\n")
     return "\n\n" + "\n".join(parts)

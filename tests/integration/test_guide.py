@@ -239,9 +239,9 @@ def test_the_commands_of_a_domain_run_beside_each_other(tmp_path: Path, monkeypa
 
 
 def test_every_public_name_is_on_one_page_of_the_reference() -> None:
-    directives = r"^\.\. auto(?:class|exception|function|data):: ([\w.]+)\.(\w+)"
+    directives = r"^\.\. (?:auto(?:class|exception|function|data):: ([\w.]+)\.|data:: )(\w+)"
     listed = [found for page in REFERENCE for found in re.findall(directives, page.read_text(), re.MULTILINE)]
-    documented = [id(getattr(importlib.import_module(path), name)) for path, name in listed]
+    documented = [id(getattr(importlib.import_module(path or "tfbus"), name)) for path, name in listed]
     assert len(documented) == len(set(documented))
     for path in PUBLIC:
         module = importlib.import_module(path)

@@ -6,6 +6,7 @@ variable ``ROSBRIDGE`` is a command that serves a rosbridge at the port that is 
 """
 
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import anyio
 import pytest
+from anyio.streams.buffered import BufferedByteReceiveStream
 from support.both_sides import (
     SECONDS,
     URDF,
@@ -39,6 +41,7 @@ pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
 
 PEER = Path(__file__).parents[1] / "support" / "ros2_peer.py"
 MESSAGES = PEER.with_name("real_ros_messages.py")
+WATCHER = PEER.with_name("ros2_watcher.py")
 ROBOT = PEER.with_name("ros2_robot.py")
 CYCLONE_PEER = PEER.with_name("cyclone_peer.py")
 
@@ -201,6 +204,28 @@ async def test_a_late_link_has_the_static_frames_of_ros_and_of_other_links(kind:
                     async with link_of(late_bus):
                         await late.lookup("base", "laser", timeout=40.0)
                         await late.lookup("arm", "tool", timeout=40.0)
+
+
+@on_one_loop
+async def test_ros_lists_a_link_over_dds_as_a_node_with_what_it_publishes_until_it_ends() -> None:
+    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+    from tfbus.links.dds import DdsLink
+
+    domain = new_dds_domain()
+    variables = {**os.environ, **environment(domain)}
+    async with await anyio.open_process([ros2_python(), str(WATCHER)], env=variables, stderr=None) as watcher:
+        assert watcher.stdout is not None
+        lines = BufferedByteReceiveStream(watcher.stdout)
+        try:
+            with anyio.fail_after(30), Bus() as bus:
+                assert await lines.receive_until(b"\n", 1_000) == b""
+                async with DdsLink(bus, domain):
+                    name, *topics = (await lines.receive_until(b"\n", 1_000)).decode().split()
+                assert await lines.receive_until(b"\n", 1_000) == b""
+        finally:
+            watcher.kill()
+    assert re.fullmatch(f"/tfbus_[A-Za-z0-9_]+_{os.getpid()}", name)
+    assert topics == ["/tf", "/tf_static"]
 
 
 def test_messages_of_rclpy_become_data_and_messages_again() -> None:

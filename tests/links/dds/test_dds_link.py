@@ -1,5 +1,6 @@
 import math
 import os
+import re
 import struct
 import sys
 from collections.abc import AsyncIterator, Iterator
@@ -32,6 +33,7 @@ from tfbus.links.dds.types import (
     Header,
     ParticipantEntitiesInfo,
     RawClock,
+    RawEntitiesInfo,
     RawJointState,
     RawString,
     RawTFMessage,
@@ -122,6 +124,30 @@ async def test_others_see_the_name_of_the_program_of_a_link_and_its_process(doma
             names = {readers.name_of(each) for each in readers.read(reader)}
         readers.delete(reader)
     assert names == {"", f"tfbus {Path(sys.argv[0]).name} [{os.getpid()}]"}
+
+
+async def test_a_link_is_a_node_with_its_publishers_until_it_ends(domain_number: int) -> None:
+    told: list[Any] = []
+    with DdsNode(domain_number) as node:
+        reader = node.reader("ros_discovery_info", RawEntitiesInfo)
+
+        def has_told(count: int) -> bool:
+            told.extend(each.read() for each in reader.take(N=10) if isinstance(each, RawEntitiesInfo))
+            return len(told) >= count
+
+        async with joined(domain_number) as hearing:
+            await until(lambda: has_told(1))
+            async with joined(domain_number) as sending:
+                await until(lambda: has_told(2))
+                sending.bus.publish(static("map", "lidar"))
+                await hearing.until_heard("lidar")
+            await until(lambda: has_told(3))
+        await until(lambda: has_told(4))
+    (first, [(name, _)]), (second, [(_, publishers)]), *gone = told
+    assert gone == [(second, []), (first, [])]
+    assert name == f"/{re.sub(r'[^a-z0-9]+', '_', f'tfbus {Path(sys.argv[0]).name}')}_{os.getpid()}"
+    assert [sample.authority for sample in hearing.heard] == [name]
+    assert len(set(publishers)) == 2
 
 
 async def test_a_participant_is_a_peer_while_it_publishes_on_any_topic(domain_number: int) -> None:

@@ -12,9 +12,10 @@ A participant is a peer as long as one of its writers is matched, on any topic o
 """
 
 import os
+import re
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from threading import Lock, Thread
 from typing import Any, Literal, Unpack, get_args
@@ -45,9 +46,19 @@ from tfbus.links.dds.readers import (
     is_of_ros,
     join,
     name_of,
+    program,
     read,
 )
-from tfbus.links.dds.types import RawClock, RawEntitiesInfo, RawJointState, RawString, RawTFMessage
+from tfbus.links.dds.types import (
+    Gid,
+    NodeEntitiesInfo,
+    ParticipantEntitiesInfo,
+    RawClock,
+    RawEntitiesInfo,
+    RawJointState,
+    RawString,
+    RawTFMessage,
+)
 from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, as_domain, settings_of
 from tfbus.links.seams import Joined, Left, Received
@@ -148,6 +159,7 @@ _DEPTH = 5_000
 """So many messages wait in DDS for their reader. The topics have no keys, so all writers of a topic share them."""
 _KEPT = 100
 """So many of its own messages a writer repeats when they were lost, as tf2's broadcasters do."""
+_NODES = "ros_discovery_info"
 _OTHERS = "other topics"
 """The authority of joint positions and of the time."""
 _AT_ONCE = 16
@@ -202,6 +214,7 @@ class DdsCarrier(RosCarrier):
         self._greetings: dict[int, Greeting] = {}
         self._behind: dict[DataReader[Any], int] = {}
         self._present: frozenset[str] = frozenset()
+        self._subscriptions: list[DataReader[Any]] = []
         self._moving_writer: DataWriter[RawTFMessage]
         self._static_writer: DataWriter[RawTFMessage]
 
@@ -225,7 +238,7 @@ class DdsCarrier(RosCarrier):
             if self.settings.authority is None:
                 self._participants = BuiltinDataReader(participant, BuiltinTopicDcpsParticipant)
                 self._open.callback(delete, self._participants)
-                info = Topic(participant, "ros_discovery_info", RawEntitiesInfo)
+                info = Topic(participant, _NODES, RawEntitiesInfo)
                 thread.watch(self._reader(participant, info, _STATICS), self._take_nodes)
             for name in self.settings.joint_topic:
                 joints = Topic(participant, f"rt{name}", RawJointState)
@@ -244,6 +257,7 @@ class DdsCarrier(RosCarrier):
                     self._greetings[number] = Greeting(partial(DataReader, participant, topics[name], _SECOND))
                     self._open.callback(self._greetings[number].close)
                 thread.watch(reader, partial(self._take, static), partial(self._match, number))
+            self._introduce(participant)
             thread.start()
             self._open.callback(thread.stop)
         except DDSException as error:
@@ -252,7 +266,29 @@ class DdsCarrier(RosCarrier):
     def _reader(self, participant: DomainParticipant, topic: Topic[Any], qos: Qos) -> DataReader[Any]:
         reader: DataReader[Any] = DataReader(participant, topic, qos)
         self._open.callback(delete, reader)
+        self._subscriptions.append(reader)
         return reader
+
+    def _introduce(self, participant: DomainParticipant) -> None:
+        """Tell ROS 2 that this program is a node, and that it has gone when the link ends.
+
+        Without the second, Fast DDS lists the node until it has not heard of the participant for 10 s.
+        """
+        telling: DataWriter[ParticipantEntitiesInfo]
+        telling = DataWriter(participant, Topic(participant, _NODES, ParticipantEntitiesInfo), _STATIC)
+        self._open.callback(delete, telling)
+
+        def tell(*nodes: NodeEntitiesInfo) -> None:
+            sequence: Any = nodes
+            with suppress(DDSException):
+                telling.write(ParticipantEntitiesInfo(Gid.of(participant), sequence))
+
+        name: Any = re.sub(r"[\W_]+", "_", program(), flags=re.ASCII).strip("_")
+        publishers = (self._moving_writer, self._static_writer) if self.settings.send else ()
+        ids: list[Any] = [[Gid.of(each) for each in entities] for entities in (self._subscriptions, publishers)]
+        root: Any = "/"
+        tell(NodeEntitiesInfo(root, name, *ids))
+        self._open.callback(tell)
 
     async def run(self) -> None:
         """Let no message wait for the name of its node for ever."""
@@ -418,7 +454,7 @@ class DdsLink(RosLink):
     **options
         All links to ROS share them: see `tfbus.links.ros.RosLink`. By default, the authority of a sample is the
         node that has published it, such as ``/robot_state_publisher``; for a program that is no node, the name of its
-        participant, such as ``tfbus robot.py [4711]`` for a program with a link, or else the id of that.
+        participant, or else the id of that.
 
     Attributes
     ----------
@@ -444,8 +480,9 @@ class DdsLink(RosLink):
     -----
     The qualities of service are those of tf2: all is reliable, ``/tf_static`` is transient local. A peer is a process
     with a broadcaster. Entering takes up to 1.6 s where there are ROS 2 programs, and then their frames come at once.
-    Every program that reaches the domain can publish there, and read everything. The participant of the link is named
-    after the program, for tools of DDS such as ``cyclonedds ps``; it is no node, so ``ros2 node list`` lacks it.
+    Every program that reaches the domain can publish there, and read everything. The link is a node, named after the
+    program and its process, such as ``/tfbus_robot_py_4711``, for ``ros2 node list``; its participant is
+    ``tfbus robot.py [4711]``, for tools of DDS such as ``cyclonedds ps``.
 
     Examples
     --------

@@ -44,6 +44,7 @@ GREETING_TIME = 0.5
 _PERIOD = 0.002
 _MOST = 10_000
 _LONGEST_NAME = 256
+_LONGEST_PROGRAM = 200
 _OF_ROS = b"enclave="
 _CYCLONE = "0110"
 """The ids of writers of Cyclone DDS begin so; it greets until it is understood."""
@@ -58,8 +59,7 @@ def join(number: int, stack: ExitStack) -> DomainParticipant:
         If the domain cannot be joined.
     """
     # The library talks of endpoints through the first participant of a process, so this one stays.
-    # Tools of DDS show it, and links to the same domain, for which it is the authority of what comes from here.
-    named = Qos(Policy.EntityName(f"tfbus {Path(sys.argv[0]).name or 'python'} [{os.getpid()}]"))
+    named = Qos(Policy.EntityName(program()))
     first = DomainParticipant(number, named)
     stack.callback(delete, first)
     programs = _answering(first)
@@ -69,6 +69,11 @@ def join(number: int, stack: ExitStack) -> DomainParticipant:
     _wait(lambda: programs <= {each.participant_key.hex for each in read(writers)}, WRITERS_TIME)
     delete(writers)
     return participant
+
+
+def program() -> str:
+    """The name of this program and the number of its process, which tools of DDS show."""
+    return f"tfbus {Path(sys.argv[0]).name[:_LONGEST_PROGRAM] or 'python'} [{os.getpid()}]"
 
 
 def read(reader: BuiltinDataReader) -> list[Any]:

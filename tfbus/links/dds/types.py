@@ -8,6 +8,7 @@ import struct
 from dataclasses import dataclass
 from typing import Any, Self
 
+from cyclonedds.core import Entity
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, bounded_str, float64, int32, sequence, uint8, uint32
 
@@ -167,6 +168,12 @@ class Gid(IdlStruct, typename="rmw_dds_common::msg::dds_::Gid_"):
     """``rmw_dds_common/msg/Gid``: the id of a participant or of a writer, as DDS has it."""
 
     data: array[uint8, 16]
+
+    @classmethod
+    def of(cls, entity: Entity) -> Self:
+        """The id of an entity of this process."""
+        data: Any = list(entity.guid.bytes)
+        return cls(data)
 
 
 @dataclass
