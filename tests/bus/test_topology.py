@@ -186,9 +186,8 @@ def test_a_clock_of_the_machine_that_was_set_back_is_told_when_samples_expire(ca
         bus.publish([moving("map", "base", NOW - HOUR + k, authority="odometry") for k in range(2)])
         found = [event for event in iter(events.queue.get, None) if isinstance(event, StampAhead)]
     assert found == [StampAhead(NOW - HOUR, "base", NOW, "odometry")]
-    assert caplog.messages == [
-        "frame 'base' has a sample from 'odometry' that is 3600 s ahead of the clock: right samples are older, and expire"
-    ]
+    (line,) = caplog.messages
+    assert line.startswith("frame 'base' has a sample from 'odometry' that is 3600 s ahead of the clock")
     assert bus.statistics().buffers[0].expired_ahead == 2
 
 
