@@ -93,7 +93,7 @@ def show(rounds: list[float], unit: str) -> str:
 def conditions() -> str:
     """The versions and the machine that the times depend on."""
     found = {each.name.replace("_", "-"): each.version for each in distributions()}
-    versions = [f"{name} {found.get(name, 'not installed')}" for name in ("numpy", "transform-tree", "pytransform3d")]
+    versions = [f"{name} {found.get(name, 'not installed')}" for name in ("numpy", "transform-tree")]
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "not set")
     machine = f"{os.cpu_count()} cores ({platform.machine()}), OPENBLAS_NUM_THREADS {threads}"
     return f"Python {platform.python_version()}, {', '.join(versions)}; {machine}"

@@ -1,8 +1,7 @@
 """Many stamps and many points at once, beside the libraries that do the same and a loop over tf2.
 
 The sides take turns in each round, and their answers are compared; a benchmark whose peer is not installed is skipped.
-transform-tree and tfbus give the same transforms, one as matrices, the other as columns. pytransform3d moves along
-screws, so that it agrees at the samples only, and it is checked there.
+transform-tree and tfbus give the same transforms, one as matrices, the other as columns.
 """
 
 from collections.abc import Callable
@@ -22,7 +21,6 @@ from tfbus import SECOND, PointCloud, TransformStamped
 pytest_plugins = ["side_by_side"]
 
 FEW_ROUNDS = 7
-"""For calls that take pytransform3d up to a second."""
 POINTS = 100_000
 SWEEP = SECOND // 10
 HANDFUL = 5
@@ -74,16 +72,6 @@ def transform_tree(chain: str) -> Callable[[Stamps], Floats]:
     return matrices
 
 
-def pytransform3d(chain: str) -> Callable[[Stamps], Floats]:
-    """The answers of pytransform3d, whose time is in seconds."""
-    manager = pytest.importorskip("pytransform3d.transform_manager")
-    transforms = manager.TemporalTransformManager()
-    for parent, child, stamps, translations, wxyz in series_of(chain):
-        motion = manager.NumpyTimeseriesTransform((stamps - START) / SECOND, np.hstack((translations, wxyz)))
-        transforms.add_transform(child, parent, motion)
-    return lambda stamps: transforms.get_transform_at_time(last_of(chain), BASE, (stamps - START) / SECOND)
-
-
 @CHAINS
 def test_one_lookup_by_name(table: Table, chain: str) -> None:
     peer = transform_tree_of(series_of(chain))
@@ -121,7 +109,7 @@ def test_the_latest_of_edges_with_equal_stamps(table: Table, chain: str) -> None
 
 
 @pytest.mark.parametrize("order", ["sorted", "random"])
-@pytest.mark.parametrize("peer", ["transform-tree", "pytransform3d", "tf2 in a loop"])
+@pytest.mark.parametrize("peer", ["transform-tree", "tf2 in a loop"])
 @CHAINS
 def test_many_stamps(table: Table, tf2: Ask | None, chain: str, order: str, peer: str) -> None:
     case = Case(f"many, {order}", chain)
@@ -134,11 +122,8 @@ def test_many_stamps(table: Table, tf2: Ask | None, chain: str, order: str, peer
         assert found[-1].translation == pytest.approx(tf2(case)[1], abs=1e-6)
         theirs: Turn = lambda: tf2(case)[0]  # noqa: E731
     else:
-        matrices = transform_tree(chain) if peer == "transform-tree" else pytransform3d(chain)
-        compared = stamps if peer == "transform-tree" else series_of(chain)[0].stamps[1:-1]
-        if peer == "transform-tree" or chain == "m":
-            ours_there = tree.lookup_many(BASE, source, compared).matrices()
-            np.testing.assert_allclose(ours_there, matrices(compared), rtol=0, atol=1e-12)
+        matrices = transform_tree(chain)
+        np.testing.assert_allclose(found.matrices(), matrices(stamps), rtol=0, atol=1e-12)
         theirs = timed(lambda: matrices(stamps), MANY)
     ours, rounds = take_turns(timed(lambda: tree.lookup_many(BASE, source, stamps), MANY), theirs, rounds=FEW_ROUNDS)
     wanted = "<= 0.125" if peer == "tf2 in a loop" else ""

@@ -2,25 +2,21 @@
 
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import pairwise
 from statistics import median
 from typing import Any
 
 import anyio
 import anyio.lowlevel
 import pytest
-import zenoh
 from beside import Table
 from support.peer_process import link_of
-from support.processes import Place, free_address, new_domain, until
-from support.samples import moving, static
+from support.processes import Place, free_address, new_domain
+from support.samples import static
 
-from tfbus import Buffer, Bus
-from tfbus.links import BufferServer
+from tfbus import Bus
 from tfbus.links.zenoh import ZenohLink
 
 pytest_plugins = ["side_by_side"]
@@ -40,27 +36,14 @@ async def main(options, frames):
             print(time.perf_counter() - began)
 """
 
-# A robot's own buffer, and beside it a bare queryable, whose answers are as long.
+# A robot's own buffer.
 SERVER = """
-async def main(options, bare):
-    with Bus() as bus, Buffer(bus, keep=None) as buffer, session(listen=bare) as zenoh_session:
+async def main(options):
+    with Bus() as bus, Buffer(bus, keep=None) as buffer:
         bus.publish([static("base", "lidar", x=2.0), moving("map", "base", 5, x=1.0), moving("map", "base", 9, x=5.0)])
-        answer = lambda query: query.reply(query.key_expr, bytes(400), express=True)
-        queryable = zenoh_session.declare_queryable("bare", zenoh.handlers.Callback(answer, indirect=False))
         async with link_of(bus, options) as link, BufferServer(buffer, link):
             print("ready", flush=True)
             await anyio.to_thread.run_sync(sys.stdin.read)
-"""
-
-# A process that asks for a stamp, from its input, many times at once.
-ASKER = """
-async def main(options, count):
-    async with link_of(Bus(), options) as client, anyio.create_task_group() as tasks:
-        print("ready", flush=True)
-        stamp = int(await anyio.to_thread.run_sync(sys.stdin.readline))
-        for _ in range(count):
-            tasks.start_soon(client.lookup, "map", "base", stamp)
-        await anyio.sleep_forever()
 """
 
 # A router that tells its CPU time for each line of input.
@@ -89,24 +72,12 @@ HEADER = """
 import json, sys, time
 from contextlib import AsyncExitStack
 import anyio, anyio.to_thread
-import zenoh
 from support.peer_process import link_of
 from support.samples import moving, static
-from test_fleet import session
 from tfbus import Buffer, Bus
 from tfbus.links import BufferServer
 from tfbus.links.zenoh import ZenohLink, ZenohRouter
 """
-
-
-def session(**addresses: str) -> zenoh.Session:
-    """A bare session of zenoh that listens or connects at an address, and looks for nobody else."""
-    config = zenoh.Config()
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("listen/endpoints", "[]")
-    for side, address in addresses.items():
-        config.insert_json5(f"{side}/endpoints", f'["{address}"]')
-    return zenoh.open(config)
 
 
 def command(program: str, *arguments: Any) -> list[str]:
@@ -154,9 +125,7 @@ def test_statics(frames: int, wanted: str, table: Table, place: Place) -> None:
 
 
 def test_remote_lookup(table: Table, place: Place) -> None:
-    bare_address = free_address()
-    ours: list[float] = []
-    bare: list[float] = []
+    times: list[float] = []
 
     async def main() -> None:
         async with link_of(Bus(), place.other(robots={"*": 0.0})) as client:
@@ -164,19 +133,11 @@ def test_remote_lookup(table: Table, place: Place) -> None:
             for _ in range(ASKED):
                 began = time.perf_counter()
                 await client.lookup("map", "lidar", 7)
-                ours.append(time.perf_counter() - began)
-                ended = threading.Event()
-                began = time.perf_counter()
-                take: Any = zenoh.handlers.Callback(lambda _: None, ended.set, indirect=False)
-                asking.get("bare", take, payload=bytes(300), express=True)
-                assert ended.wait(10)
-                bare.append(time.perf_counter() - began)
+                times.append(time.perf_counter() - began)
 
-    with running(SERVER, place.first(), bare_address), session(connect=bare_address) as asking:
+    with running(SERVER, place.first()):
         anyio.run(main)
-    label = f"{median(bare) * 1e3:.2f} ms for a bare query"
-    ratio = f"{median(ours) / median(bare):.2f}"
-    table.add(f"{place.carrier}: remote lookup, p50", f"{median(ours) * 1e3:.2f} ms", label, ratio, "<= 0.25 ms")
+    table.add(f"{place.carrier}: remote lookup, p50", f"{median(times) * 1e3:.2f} ms", wanted="<= 0.25 ms")
 
 
 def test_one_robot_of_many(table: Table) -> None:
@@ -202,60 +163,3 @@ def test_one_robot_of_many(table: Table) -> None:
     for name, cost, least in zip(("subscriber", "router"), many, few, strict=True):
         label = f"one robot of {MANY}, the {name}"
         table.add(label, f"{cost:.3f} cores", f"of 5: {least:.3f}", f"{cost / least:.2f}", "<= 1.2")
-
-
-def test_samples_that_nobody_hears(table: Table, place: Place) -> None:
-    """The cost of a link whose samples nobody subscribes to, for batches of 20 frames."""
-    turns, frames = 2_000, 20
-
-    async def main() -> float:
-        with Bus() as bus:
-            async with link_of(bus, place.first()):
-                before = time.process_time()
-                for turn in range(turns):
-                    bus.publish([moving("map", f"f{frame}", turn) for frame in range(frames)])
-                    await anyio.lowlevel.checkpoint()
-                return (time.process_time() - before) / turns / frames
-
-    costs = [anyio.run(main) for _ in range(5)]
-    table.add(
-        f"{place.carrier}: a sample that nobody hears",
-        f"{median(costs) * 1e6:.2f} us",
-        f"{max(costs) * 1e6:.2f} at worst",
-    )
-
-
-def test_remote_waits(table: Table, place: Place) -> None:
-    """The server's CPU time for lookups that wait, and for a publication that answers none of them."""
-    spent: list[list[float]] = []
-
-    async def main() -> None:
-        with Bus() as bus, Buffer(bus, keep=None) as buffer:
-            bus.publish(moving("map", "base", 0))
-            async with link_of(bus, place.first()) as link, BufferServer(buffer, link) as server:
-
-                def answered() -> int:
-                    return server.statistics().answered
-
-                for stamp in (10**6, 2 * 10**6, 3 * 10**6):
-                    with running(ASKER, place.other(robots={"*": 0.0}), ASKED) as ask:
-                        whole = answered() + ASKED
-                        times = [time.process_time()]
-                        ask(stamp, False)
-                        await until(lambda: server.statistics().waiting == ASKED)
-                        times.append(time.process_time())
-                        for earlier in range(ASKED, 0, -1):
-                            bus.publish(moving("map", "base", stamp - earlier))
-                        times.append(time.process_time())
-                        bus.publish(moving("map", "base", stamp))
-                        while answered() < whole:  # noqa: ASYNC110 - zenoh's threads wake no event here
-                            await anyio.sleep(0.002)
-                        times.append(time.process_time())
-                        spent.append([(end - start) / ASKED * 1e6 for start, end in pairwise(times)])
-
-    anyio.run(main)
-    asked, published, replied = (median(part) for part in zip(*spent, strict=True))
-    table.add(
-        f"{place.carrier}: a wait, {ASKED} remote ones", f"{asked + replied:.0f} us CPU", f"its answer {replied:.0f} us"
-    )
-    table.add(f"{place.carrier}: a publish that wakes none of {ASKED}", f"{published:.0f} us CPU")

@@ -8,7 +8,7 @@ from typing import Any
 
 import anyio
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from support.samples import any_samples, moving, over, static, tree_of, x_of
 
@@ -164,6 +164,8 @@ class Alone:
             happen(self.bus, self.clock, happening)
 
 
+# A closed buffer keeps a frame that is removed for those which it shared it with.
+@example([Join(3, None), Join(3, None), Publish((moving("a", "b", 1),)), Close(0), Remove("b")])
 @given(steps)
 def test_buffers_that_share_a_tree_answer_as_each_would_alone(steps: list[Step]) -> None:
     clock = SimulatedClock(1_000)

@@ -12,7 +12,7 @@ import anyio.lowlevel
 import anyio.to_thread
 import pytest
 from anyio.abc import TaskGroup
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from support.asking import Asked, driving, settle
 from support.samples import any_samples, moving, static
@@ -184,6 +184,12 @@ some_samples = any_samples("abcd", 20) | st.builds(
 )
 
 
+# A gap that is too wide while another edge lags, late samples that close it, and one that the window forgets.
+GAP: list[list[TransformStamped] | str] = [[moving("a", "b", stamp)] for stamp in (9, 10, 11)]
+
+
+@example(4, [*GAP, [moving("a", "b", 4), moving("a", "b", 6)], [moving("b", "c", 6)]], None, SimulatedClock)
+@example(4, [*GAP, [moving("a", "b", 20)], [moving("b", "c", 6)]], 8 * NANO, SimulatedClock)
 @given(
     st.integers(0, 5),
     st.lists(st.lists(some_samples, min_size=1, max_size=3) | st.sampled_from("bcd"), min_size=5, max_size=15),

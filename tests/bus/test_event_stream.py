@@ -19,7 +19,6 @@ from tfbus import (
     FrameRemoved,
     FrameStale,
     InvalidTransformError,
-    PastLoop,
     QueueStatistics,
     Reparented,
     SampleRejected,
@@ -152,17 +151,6 @@ def test_an_initial_event_of_a_frame_ahead_of_the_clock_is_given_once() -> None:
 
 def rejected(frame: str | None, authority: str | None, reason: str = "authority") -> SampleRejected:
     return SampleRejected(1, reason, frame, "map", authority, ValueError())
-
-
-def test_a_loop_in_the_past_is_given_once_for_a_frame_authority_and_parent() -> None:
-    queue = EventQueue(100)
-    loops: list[Event] = [
-        PastLoop(1, frame, parent, authority, 0, (frame, parent, frame))
-        for frame, parent, authority in (("a", "b", "x"), ("a", "c", "x"), ("a", "b", "y"), ("d", "b", "x"))
-    ]
-    for event in (*loops, *loops, rejected("a", "x", "b")):
-        queue.put(event)
-    assert emptied(queue) == [*loops, rejected("a", "x", "b")]
 
 
 def test_memory_is_bounded_for_rejections_of_new_frames_and_authorities() -> None:

@@ -1,6 +1,7 @@
 """The command as a whole: help, options of all commands, exit statuses, missing extras and closed pipes."""
 
 import inspect
+import json
 import logging
 import os
 import re
@@ -16,7 +17,7 @@ from typing import Any
 import pytest
 from support.commands import Command
 from support.processes import PATIENCE, TFBUS, Program, new_domain
-from support.recorded import write_mcap
+from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
 from tfbus import Bus, kernel
@@ -24,7 +25,6 @@ from tfbus.cli import run
 from tfbus.cli.application import COMMANDS, application
 from tfbus.cli.arguments import CsvFlag, Flag, JsonFlag, UsageError
 from tfbus.cli.domain import LinkOptions
-from tfbus.errors import pip_install
 
 URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
 
@@ -218,35 +218,52 @@ def test_letters_that_the_output_cannot_encode_are_escaped(tmp_path: Path) -> No
     assert run_process(TFBUS, env=ascii_only).stdout.isascii()
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("package", "arguments", "status", "message"),
-    [
-        ("cyclopts", "tree", 1, f"the command needs more packages: {pip_install('cli')}"),
-        ("zenoh", "router", 2, f"a router needs one more package: {pip_install('cli,zenoh')}"),
-        *(
-            ("zenoh", f"{words} tcp/127.0.0.1:1", 2, f"{NEED} {pip_install('cli,zenoh')}")
-            for words in ("listen --connect", "tree --listen", "bridge tf dds --connect")
-        ),
-        (
-            "mcap.writer",
-            "record run.mcap --domain DOMAIN",
-            2,
-            f"recording needs one more package: {pip_install('bag')}",
-        ),
-        (
-            "urdf_parser_py",
-            f"robot {URDF} --tree",
-            2,
-            f"to read URDF, tfbus needs one more package: {pip_install('urdf')}",
-        ),
-    ],
-)
-def test_a_missing_extra_is_named(package: str, arguments: str, status: int, message: str, tmp_path: Path) -> None:
-    hidden = f"import sys; sys.modules[{package!r}] = None; from tfbus.cli import main; main()"
-    words = arguments.replace("DOMAIN", new_domain()).split()
-    done = run_process(sys.executable, "-P", "-c", hidden, *words, cwd=tmp_path)
-    assert (done.returncode, done.stdout, done.stderr) == (status, "", f"tfbus: {message}\n")
+WITHOUT_EXTRAS = """
+import json, sys
+from importlib import import_module
+from tfbus.cli import run
+rooms, commands = json.loads(sys.argv[1])
+sys.modules.update(dict.fromkeys(["cyclonedds", "foxglove", "matplotlib", "mcap", "pyarrow", "ruamel"]))
+sys.modules.update(dict.fromkeys(["urdf_parser_py", "viser", "wsproto", "zenoh"]))
+for room in rooms:
+    try:
+        import_module(f"tfbus.{room}")
+    except ImportError as error:
+        print(error)
+for command in commands:
+    assert run(command.split()) == 2, command
+sys.modules["cyclopts"] = None
+run(["tree"])
+"""
+
+
+def test_rooms_and_commands_without_their_extras_name_them(tmp_path: Path) -> None:
+    rooms = {"plot": "plot", "view": "view", "links.dds": "dds", "links.foxglove": "foxglove"}
+    rooms |= {"links.rosbridge": "rosbridge", "links.rmw_zenoh": "zenoh", "links.zenoh": "zenoh"}
+    (tmp_path / "rig.yaml").write_text("laser:\n  parent: base\n")
+    commands = {
+        "router": "a router needs one more package: |cli,zenoh",
+        "listen --connect tcp/127.0.0.1:1": f"{NEED} |cli,zenoh",
+        "tree --listen tcp/127.0.0.1:1": f"{NEED} |cli,zenoh",
+        "bridge tf dds --connect tcp/127.0.0.1:1": "a link over DDS needs one more package: |dds",
+        f"record run.mcap --domain {new_domain()}": "recording needs one more package: |bag",
+        f"robot {URDF} --tree": "to read URDF, tfbus needs one more package: |urdf",
+        f"plot {SMALL} map odom": "for plots, tfbus needs one more package: |plot",
+        "view": "for the live page, tfbus needs more packages: |view",
+        "foxglove": "serving Foxglove needs one more package: |foxglove",
+        f"query {SMALL} map odom --parquet x.parquet": "--parquet needs one more package: |parquet",
+        "static rig.yaml": "to read YAML, tfbus needs one more package: |bag",
+        f"convert {SMALL} x.mcap": "recording 'x.mcap': to write it, tfbus needs more packages: |bag",
+    }
+    asked = json.dumps([[*rooms], [*commands]])
+    done = run_process(sys.executable, "-P", "-c", WITHOUT_EXTRAS, asked, cwd=tmp_path)
+    assert done.returncode == 1
+    expected = [*commands.values(), "the command needs more packages: |cli"]
+    told = [line for line in done.stderr.splitlines() if "left out of" not in line]
+    for line, (need, _, extras) in zip(told, (text.partition("|") for text in expected), strict=True):
+        assert line.startswith(f'tfbus: {need}pip install "tfbus[{extras}]"')
+    for line, extra in zip(done.stdout.splitlines(), rooms.values(), strict=True):
+        assert f'pip install "tfbus[{extra}]"' in line
 
 
 @pytest.mark.thorough

@@ -13,7 +13,6 @@ from typing import Any
 import rospy  # type: ignore[import-not-found]
 import tf2_py  # type: ignore[import-not-found]
 from bags import transforms_in
-from deviations import DEVIATIONS
 from geometry_msgs.msg import TransformStamped  # type: ignore[import-not-found]
 from steps import LATEST, SECOND, Scenario, Stamp, Step, verb_of
 
@@ -26,14 +25,8 @@ def record(scenario: Scenario) -> Step:
     recorded: list[Step] = []
     for step in scenario.steps:
         verb = verb_of(step)
-        new = {verb: step[verb], "tf2": _ask(core, verb, step[verb])}
-        if "deviation" in step:
-            deviation = DEVIATIONS[step["deviation"]]
-            new["tfbus"] = step["tfbus"]
-            new["deviation"] = step["deviation"]
-            new["expected_by"] = deviation.expected_by
-            new["reason"] = deviation.reason
-        recorded.append(new)
+        stated = {key: value for key, value in step.items() if key != verb}
+        recorded.append({verb: step[verb], "tf2": _ask(core, verb, step[verb]), **stated})
     return {"scenario": scenario.name, "keep": scenario.keep, "steps": recorded}
 
 

@@ -443,7 +443,7 @@ async def test_a_link_that_found_no_place_is_not_heard_and_is_met_once_there_is_
             receive = network.wires[link.id].receive
             for number in range(MAX_PEERS + 5):
                 receive(f"{number:032x}", Joined(""))
-            await until(lambda: len(link.peers) == MAX_PEERS and link.statistics().rejected["too many peers"] == 5)
+            await until(lambda: len(link.peers) == MAX_PEERS and link.statistics().rejected.get("too many peers") == 5)
             assert f"{MAX_PEERS:032x}" not in link.peers
             receive(f"{MAX_PEERS:032x}", live(OutgoingBatch(BUS, 1, (static("map", "a"),))))
             await until(lambda: link.statistics().queue.pending == 0)

@@ -4,7 +4,6 @@ import os
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -14,10 +13,9 @@ from itertools import count
 from pathlib import Path
 from random import Random
 from typing import Any
-from uuid import uuid4
 
 import pytest
-from support.processes import PATIENCE, Crowd, PeerProcess, Program, free_address, new_domain
+from support.processes import Crowd, PeerProcess, Program, free_address, new_domain
 
 LIMIT = float(os.environ.get("FAULT_LIMIT", "10"))
 """s; so long after a fault all buses are equal."""
@@ -29,18 +27,17 @@ Said = tuple[bool, int, float]
 class Member:
     """A place for processes one after another, each with links to some networks; what the newest has heard."""
 
-    def __init__(self, name: str, networks: tuple[str, ...], links: list[dict[str, Any]], prefix: tuple[str, ...]):
+    def __init__(self, name: str, networks: tuple[str, ...], links: list[dict[str, Any]]) -> None:
         self.name = name
         self.networks = networks
         self.links = links
-        self.prefix = prefix
         self.process: PeerProcess
         self.ids: list[str] = []
         self.busy: int | None = None
         self.stopped = False
 
     def begin(self, processes: Crowd, backend: str) -> None:
-        self.process = processes.begin(*self.links, backend=backend, prefix=self.prefix, keeps=True)
+        self.process = processes.begin(*self.links, backend=backend, keeps=True)
         self.log: list[Any] = []
         self.shown: dict[str, Said] = {}
         self.present: set[str] = set()
@@ -102,11 +99,9 @@ class World:
         self._recent: set[str] = set()
         self._mending: list[Callable[[], object]] = []
 
-    def add(
-        self, name: str, networks: tuple[str, ...], links: list[dict[str, Any]], prefix: tuple[str, ...] = ()
-    ) -> None:
+    def add(self, name: str, networks: tuple[str, ...], links: list[dict[str, Any]]) -> None:
         options = {"domain": self.domain, "drop_lost": self.drop_lost}
-        self.members.append(Member(name, networks, [options | link for link in links], prefix))
+        self.members.append(Member(name, networks, [options | link for link in links]))
 
     def start(self, *members: Member) -> None:
         """Start processes at once."""
@@ -152,10 +147,7 @@ class World:
                 self.remove(member, f"{self.rng.choice((frame, self.rng.choice(self.members).name + '/b'))}")
             else:
                 self.publish(member, frame)
-        time.sleep(self.rng.choice((0.0, 0.1, 0.5, 2.0, 5.0, 12.0)[: self.longest_pauses]))
-
-    longest_pauses = 6
-    """So many of the pauses of `live` are drawn from, the shortest first."""
+        time.sleep(self.rng.choice((0.0, 0.1, 0.5, 2.0, 5.0, 12.0)))
 
     def mend(self) -> None:
         for member in self.members:
@@ -247,12 +239,12 @@ class World:
                 )
         return None
 
-    def run(self, rounds: int = 0, seconds: float = 0.0) -> str:
-        """Break and mend for so many rounds or so long; returns a line about it."""
+    def run(self, seconds: float) -> str:
+        """Break and mend for so long; returns a line about it."""
         self.start(*self.members)
         self.check()
         until = time.monotonic() + seconds
-        while len(self.story) <= rounds or time.monotonic() < until:
+        while time.monotonic() < until:
             self.break_something()
             self.live()
             self.mend()
@@ -331,63 +323,6 @@ class OneMachine(World):
         self.start(member)
 
 
-class Host:
-    """A network namespace with an address, in which a process may live."""
-
-    def __init__(self, name: str, number: int) -> None:
-        self.name = name
-        self.address = f"10.98.77.{number}"
-        self.prefix = ("ip", "netns", "exec", name)
-
-    def run(self, *command: str) -> None:
-        subprocess.run([*self.prefix, *command], check=True, capture_output=True, timeout=PATIENCE)
-
-    def silence(self, other: "Host") -> None:
-        """Let nothing more go to another host."""
-        self.run("ip", "route", "add", "blackhole", f"{other.address}/32")
-
-    def speak(self, other: "Host") -> None:
-        self.run("ip", "route", "delete", "blackhole", f"{other.address}/32")
-
-    def begin_to_lose(self) -> None:
-        chain = "add table inet lossy; add chain inet lossy input { type filter hook input priority 0; }"
-        self.run("nft", f"{chain}; add rule inet lossy input numgen random mod 100 < 30 drop")
-
-    def end_to_lose(self) -> None:
-        self.run("nft", "delete table inet lossy")
-
-
-@contextmanager
-def hosts(how_many: int) -> Iterator[list[Host]]:
-    """Network namespaces that reach each other by a switch; skips where there are none."""
-    ip = shutil.which("ip")
-    if ip is None or os.geteuid() != 0:
-        pytest.skip("network namespaces need root and the program ip")
-    tag = uuid4().hex[:6]
-    switch, made = f"tg{tag}s", [Host(f"tg{tag}{number}", number) for number in range(1, how_many + 1)]
-
-    def call(*arguments: str) -> None:
-        done = subprocess.run([ip, *arguments], capture_output=True, text=True, timeout=PATIENCE, check=False)
-        if done.returncode:
-            pytest.skip(f"no network namespaces here: {done.stderr.strip()}")
-
-    try:
-        for name in (switch, *(host.name for host in made)):
-            call("netns", "add", name)
-        call("-n", switch, "link", "add", "bridge", "type", "bridge")
-        call("-n", switch, "link", "set", "bridge", "up")
-        for host in made:
-            call("-n", switch, "link", "add", host.name, "type", "veth", "peer", "eth0", "netns", host.name)
-            call("-n", switch, "link", "set", host.name, "master", "bridge", "up")
-            call("-n", host.name, "address", "add", f"{host.address}/24", "dev", "eth0")
-            call("-n", host.name, "link", "set", "eth0", "up")
-            call("-n", host.name, "link", "set", "lo", "up")
-        yield made
-    finally:
-        for name in (switch, *(host.name for host in made)):
-            subprocess.run([ip, "netns", "delete", name], capture_output=True, timeout=PATIENCE, check=False)
-
-
 _ROUTER = """
 import sys, anyio
 from tfbus.links.zenoh import ZenohRouter
@@ -402,15 +337,13 @@ anyio.run(main, *sys.argv[1:])
 class Router:
     """A router in a process, at an address of its own."""
 
-    def __init__(self, address: str, host: Host | None) -> None:
-        self.address = address
-        self.host = host
+    def __init__(self) -> None:
+        self.address = free_address()
         self.others: list[str] = []
         self.program: Program | None = None
 
     def start(self) -> None:
-        prefix = () if self.host is None else self.host.prefix
-        self.program = Program(*prefix, sys.executable, "-P", "-c", _ROUTER, self.address, *self.others)
+        self.program = Program(sys.executable, "-P", "-c", _ROUTER, self.address, *self.others)
         self.program.output.expect("ready")
 
     def signal(self, number: signal.Signals) -> None:
@@ -423,50 +356,30 @@ class Router:
 
 
 class Routers(World):
-    """Processes of several hosts that are clients of one router, or of either of two that are connected.
+    """Processes that are clients of one router, or of either of two that are connected.
 
-    With `machines`, each of two hosts has two more processes, of which none has a link to a router: a bridge with both
+    With a directory, each of two has two more beside it, of which none has a link to a router: a bridge with both
     links joins them to the others.
     """
 
+    faults = ("kill", "kill_two", "kill_beside_a_stopped_one", "stop", "block", "router_killed", "router_stopped")
+
     def __init__(
-        self,
-        processes: Crowd,
-        seed: int,
-        drop_lost: bool,
-        routers: int,
-        apart: list[Host] | None,
-        directory: Path | None = None,
+        self, processes: Crowd, seed: int, drop_lost: bool, routers: int, directory: Path | None = None
     ) -> None:
         super().__init__(processes, seed, drop_lost)
-        self.faults = (
-            "kill",
-            "kill_two",
-            "kill_beside_a_stopped_one",
-            "stop",
-            "block",
-            "router_killed",
-            "router_stopped",
-        )
-        self.hosts = apart or []
-        if apart is not None:
-            self.faults += ("cut", "one_way", "flapping", "router_cut")
-            self.faults += ("lossy",) * bool(shutil.which("nft"))
-        places: list[Host | None] = [*self.hosts[-routers:]] if apart else [None] * routers
-        addresses = [free_address() if place is None else f"tcp/{place.address}:17447" for place in places]
-        self.routers = [Router(*router) for router in zip(addresses, places, strict=True)]
+        self.routers = [Router() for _ in range(routers)]
+        addresses = [router.address for router in self.routers]
         for number in range(4):
-            host = self.hosts[number] if apart else None
             turned = addresses[number % routers :] + addresses[: number % routers]
             link: dict[str, Any] = {"connect": turned, "lease": ROUTER_LEASE}
-            prefix = () if host is None else host.prefix
             if directory is None or number > 1:
-                self.add(f"{number}", ("zenoh",), [link], prefix)
+                self.add(f"{number}", ("zenoh",), [link])
             else:
                 inside = {"directory": str(directory / f"{number}")}
-                self.add(f"{number}", ("zenoh", f"local{number}"), [link, inside], prefix)
-                self.add(f"{number}-", (f"local{number}",), [inside], prefix)
-                self.add(f"{number}--", (f"local{number}",), [inside], prefix)
+                self.add(f"{number}", ("zenoh", f"local{number}"), [link, inside])
+                self.add(f"{number}-", (f"local{number}",), [inside])
+                self.add(f"{number}--", (f"local{number}",), [inside])
 
     def __enter__(self) -> "Routers":
         for router in self.routers:
@@ -486,39 +399,6 @@ class Routers(World):
                     router.signal(signal.SIGCONT)
                 router.kill()
 
-    def _cut(self, one: Host, other: Host) -> None:
-        one.silence(other)
-        self._mending.append(lambda: one.speak(other))
-
-    def _host_of(self, member: Member) -> Host:
-        return next(host for host in self.hosts if host.prefix == member.prefix)
-
-    def _cut_off(self, host: Host) -> None:
-        for router in self.routers:
-            assert router.host is not None
-            self._cut(host, router.host)
-            self._cut(router.host, host)
-
-    def fault_cut(self, member: Member, _: Member) -> None:
-        self._cut_off(self._host_of(member))
-
-    def fault_one_way(self, member: Member, _: Member) -> None:
-        router = self.rng.choice(self.routers).host
-        assert router is not None
-        self._cut(*self.rng.sample((self._host_of(member), router), 2))
-
-    def fault_flapping(self, member: Member, other: Member) -> None:
-        for _ in range(5):
-            self.fault_cut(member, other)
-            time.sleep(self.rng.choice((0.1, 0.3, 1.0)))
-            self.mend()
-            time.sleep(self.rng.choice((0.1, 0.3, 1.0)))
-
-    def fault_lossy(self, member: Member, _: Member) -> None:
-        host = self._host_of(member)
-        host.begin_to_lose()
-        self._mending.append(host.end_to_lose)
-
     def fault_router_killed(self, member: Member, other: Member) -> None:
         router = self.rng.choice(self.routers)
         router.kill()
@@ -534,14 +414,6 @@ class Routers(World):
         router = self.rng.choice(self.routers)
         router.signal(signal.SIGSTOP)
         self._mending.append(lambda: router.signal(signal.SIGCONT))
-
-    def fault_router_cut(self, _: Member, __: Member) -> None:
-        router = self.rng.choice(self.routers).host
-        assert router is not None
-        for host in self.hosts:
-            if host is not router:
-                self._cut(host, router)
-                self._cut(router, host)
 
 
 @contextmanager

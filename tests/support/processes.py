@@ -91,11 +91,9 @@ class Place:
 class PeerProcess:
     """One such process; its output is kept until a test asks for it."""
 
-    def __init__(
-        self, *links: dict[str, Any], backend: str = "asyncio", prefix: tuple[str, ...] = (), keeps: bool = False
-    ) -> None:
+    def __init__(self, *links: dict[str, Any], backend: str = "asyncio", keeps: bool = False) -> None:
         arguments = {"backend": backend, "links": links, "keeps": keeps}
-        command = [*prefix, sys.executable, str(_PROGRAM), json.dumps(arguments)]
+        command = [sys.executable, str(_PROGRAM), json.dumps(arguments)]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )

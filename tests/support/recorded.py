@@ -34,7 +34,7 @@ WRONG_IN_SMALL = {
     "self transform": 1,
     "cycle": 1,
 }
-"""The invalid transforms that `record.py` sends."""
+"""The invalid transforms in it."""
 
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 

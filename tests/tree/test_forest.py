@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.samples import moving, moving_edge, static, static_edge
+from support.samples import moving, moving_edge, static_edge
 
 from tfbus import LATEST, DisconnectedError, Transform, TransformStamped, TransformTree
 from tfbus.tree.forest import Forest, Path, PathCache, find_path
@@ -52,41 +52,6 @@ def forest(*batch: TransformStamped, window: int | None = None) -> Forest:
     for sample in batch:
         made.insert_judged(sample)
     return made
-
-
-@pytest.mark.parametrize(
-    ("stamps", "appended"),
-    [
-        ([11], True),
-        ([10], False),
-        ([9], False),
-        ([11, 12, 20], True),
-        ([10, 11], False),
-        ([11, 11], False),
-        ([12, 11], False),
-        ([11, 13, 12], False),
-    ],
-)
-def test_samples_are_appended_together_if_each_is_newer_than_those_before(stamps: list[int], appended: bool) -> None:
-    known = forest(moving("a", "b", 9, authority="me"), moving("a", "b", 10, authority="me"))
-    asked = np.array(stamps)
-    assert known.can_append("a", "b", "me", asked) is appended
-    for other in (("z", "b", "me"), ("a", "z", "me"), ("a", "b", "you")):
-        assert not known.can_append(*other, asked)
-    if appended:
-        version = known.version
-        known.append("b", asked, np.full((len(stamps), 7), 0.5))
-        assert known.version > version
-        assert known.inserted == 2 + len(stamps)
-        history = known.frames["b"]
-        assert [history.sample(i)[0] for i in range(len(history))] == [9, 10, *stamps]
-        assert history.sample(2)[1] == (0.5,) * 7
-
-
-def test_nothing_is_appended_to_a_static_an_emptied_or_a_reparented_frame() -> None:
-    known = forest(static("a", "still"), moving("a", "empty", 5), moving("z", "moved", 4), moving("a", "moved", 5))
-    known.frames["empty"].clear()
-    assert not any(known.can_append("a", child, "", np.array([9])) for child in ("still", "empty", "moved"))
 
 
 def test_a_bounded_number_of_changing_newest_paths_is_kept() -> None:
@@ -135,16 +100,6 @@ def test_every_kind_of_change_is_seen_by_those_who_read_meanwhile(change: Callab
     # Without the frame that was just being read, which no change can reach while the lock is held.
     del found["f119"], known.frames["f119"]
     assert found == {child: (history, history.newest) for child, history in known.frames.items()}
-
-
-def test_an_error_of_a_reader_ends_the_reading() -> None:
-    known = forest(moving("root", "a", 0))
-    with pytest.raises(ZeroDivisionError):
-        known.read_all(lambda _: 1 / 0)
-    assert not known.lock.locked()
-    assert known.readers == {}, "nobody is to be told of changes any longer"
-    assert known.read_all(len) == {"a": 1}
-    assert known.readers == {}
 
 
 # Searches without the lock

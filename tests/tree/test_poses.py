@@ -1,5 +1,5 @@
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from support.samples import any_samples, moving, over, static, tree_of
 
@@ -34,6 +34,7 @@ def check_against_lookups(tree: TransformTree, poses: Poses, fixed: str, at: int
             assert poses.columns[:, place] == pytest.approx(row, abs=1e-12)
 
 
+@example([*over("a", "b", (0, 10)), *over("a", "c", (0, 10)), moving("b", "d", 0, 1.0), moving("c", "d", 9, 2.0)], 5)
 @given(st.lists(any_samples("abcdef", last=10), max_size=15), STAMPS)
 def test_each_pose_is_that_of_a_lookup(samples: list[TransformStamped], at: int | Latest) -> None:
     tree = TransformTree()

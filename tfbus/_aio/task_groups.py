@@ -1,5 +1,6 @@
 """Task groups that belong to an object with an ``async with`` of its own."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Generic, NoReturn, Self, TypeVar
@@ -48,7 +49,7 @@ class OneReader(anyio.ResourceGuard):
             self._woken = None
 
 
-class OneReaderStream(Generic[ItemT]):
+class OneReaderStream(ABC, Generic[ItemT]):
     """An async iterator that one task at a time may read, filled by a bus.
 
     The iteration ends when the stream is closed and all pending items have been read. A subclass implements `_next`.
@@ -107,9 +108,9 @@ class OneReaderStream(Generic[ItemT]):
                 await self._wait()
         return item
 
+    @abstractmethod
     def _next(self) -> ItemT | None:
         """The next item; None while there is none."""
-        raise NotImplementedError
 
     async def _wait(self) -> None:
         """Wait until `wake` is called, or until it is time to look again."""

@@ -5,6 +5,7 @@ tfbus, over a wire. Nothing that a peer sends makes either of them raise.
 """
 
 import logging
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from copy import copy
@@ -48,7 +49,7 @@ class Host(Protocol):
         """Call `Endpoint.work` earlier than at the time that it has returned."""
 
 
-class Endpoint(Outbox):
+class Endpoint(Outbox, ABC):
     """The bus's end of a link.
 
     Parameters
@@ -124,9 +125,9 @@ class Endpoint(Outbox):
 
     # For the link
 
+    @abstractmethod
     async def open(self) -> None:
         """Connect to the network; raises `OSError` if it cannot."""
-        raise NotImplementedError
 
     async def run(self) -> None:
         """Do what takes time, until cancelled."""
@@ -136,6 +137,7 @@ class Endpoint(Outbox):
         """Disconnect."""
         await self._network.close()
 
+    @abstractmethod
     def attach(self) -> None:
         """Join the bus: from now on, all that is latched or published gathers here.
 
@@ -143,11 +145,10 @@ class Endpoint(Outbox):
         ------
         BusClosedError
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def detach(self) -> None:
         """Leave the bus; its peers are forgotten, and their frames stay."""
-        raise NotImplementedError
 
     def clock_jumped_back(self) -> None:
         """Take samples with the stamps of earlier ones for news."""
@@ -172,6 +173,7 @@ class Endpoint(Outbox):
         """Do the work that is due; returns the time of the next call, in s of the monotonic clock."""
         return inf
 
+    @abstractmethod
     def split(self, item: Received) -> Iterator[Any]:
         """The content of an item in parts, None where other tasks may have their turn.
 
@@ -180,7 +182,6 @@ class Endpoint(Outbox):
         MalformedMessageError
             If the rest of the item cannot be used.
         """
-        raise NotImplementedError
 
     def handle(self, sender: str, content: Any) -> None:
         """Handle a part of an item; nothing in it makes this raise."""
@@ -216,20 +217,21 @@ class Endpoint(Outbox):
 
     # For the two kinds of ends
 
+    @abstractmethod
     def _send(self, turn: Turn) -> None:
-        raise NotImplementedError
+        """Send what has gathered in a turn."""
 
     def _take_statics(self) -> dict[str, TransformStamped | None]:
         """The changes of static frames for late joiners."""
         return {}
 
+    @abstractmethod
     def _take(self, sender: str, content: Any) -> None:
         """Handle a message."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _lose(self, peer: Peer) -> tuple[str, ...]:
         """Forget the frames of a lost peer; returns them, sorted."""
-        raise NotImplementedError
 
     def _joined(self, sender: str, joined: Joined) -> None:
         """Note that a peer is there."""

@@ -68,8 +68,7 @@ async def test_a_bridge_between_rosbridge_and_rmw_zenoh_tells_what_is_refused_an
             assert bridge.errors.text.count("refused what peer") == 1
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("names", [("yard", "yard"), ("yard", "hall")])
+@pytest.mark.parametrize("names", [("yard", "yard"), pytest.param(("yard", "hall"), marks=pytest.mark.thorough)])
 def test_frames_pass_between_a_domain_of_this_machine_and_a_router_and_between_two_behind_it(
     names: tuple[str, str],
 ) -> None:

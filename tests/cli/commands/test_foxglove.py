@@ -11,8 +11,7 @@ from support.processes import new_domain, start_tfbus
 from tfbus import Bus
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+@pytest.mark.parametrize("backend", ["asyncio", pytest.param("trio", marks=pytest.mark.thorough)])
 def test_the_address_is_printed_and_served_until_ctrl_c(backend: str) -> None:
     domain = ("--domain", new_domain(), "--backend", backend)
     with start_tfbus("foxglove", "--port", "0", *domain) as server:

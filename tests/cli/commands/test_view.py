@@ -18,9 +18,14 @@ from tfbus import Buffer, Bus, view
 ROBOT = Path(__file__).parents[3] / "demos" / "robot_arm.urdf"
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("backend", ["asyncio", "trio"])
-@pytest.mark.parametrize("of", [(str(SMALL), "--urdf", str(ROBOT)), ("--domain", "DOMAIN", "--listen", "ADDRESS")])
+@pytest.mark.parametrize("backend", ["asyncio", pytest.param("trio", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(
+    "of",
+    [
+        ("--domain", "DOMAIN", "--listen", "ADDRESS"),
+        pytest.param((str(SMALL), "--urdf", str(ROBOT)), marks=pytest.mark.thorough),
+    ],
+)
 def test_the_page_of_a_recording_or_of_a_domain_is_served_until_ctrl_c(of: tuple[str, ...], backend: str) -> None:
     places = {"DOMAIN": new_domain(), "ADDRESS": free_address()}
     options = (places.get(word, word) for word in of)

@@ -316,6 +316,22 @@ async def test_a_hello_without_end_is_cut_off(directory: str) -> None:
             assert await stranger.end() == []
 
 
+@pytest.mark.parametrize(
+    ("right", "wrong", "channel"),
+    [(b"local 2", b"local 3", b""), (b"\n", b"\n?", b""), (b"robot", b"ro/bot", b""), (b"", b"", b"a channel")],
+    ids=["protocol", "id", "name", "channel"],
+)
+async def test_a_program_that_does_not_speak_the_protocol_is_not_heard(
+    directory: str, right: bytes, wrong: bytes, channel: bytes
+) -> None:
+    async with running(LocalWire(DOMAIN, directory=directory)) as ear:
+        stranger = await RawPeer.connect(files_in(directory)[0])
+        async with stranger.stream:
+            await stranger.say(stranger.hello("robot").replace(right, wrong, 1), channel)
+            heard = await stranger.end()
+        assert (len(heard), ear.items) == (2 if channel else 0, [])
+
+
 async def test_a_program_on_the_loopback_that_does_not_know_the_key_is_not_heard(directory: str) -> None:
     wire = LocalWire(DOMAIN, directory=directory, loopback=True)
     async with running(wire) as ear:

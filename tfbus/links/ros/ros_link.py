@@ -8,6 +8,7 @@ static frames that this link sends. ROS has no message that removes a frame: a r
 next message, which late joiners get; the removal of a moving frame is not sent.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Unpack
@@ -68,7 +69,7 @@ class RosMessage:
         return not (self.joints or self.clock or self.description)
 
 
-class RosCarrier(Carrier):
+class RosCarrier(Carrier, ABC):
     """A carrier to ROS, see `tfbus.links.seams.Carrier`; a subclass connects, publishes and closes.
 
     Parameters
@@ -165,17 +166,17 @@ class RosCarrier(Carrier):
     async def run(self) -> None:
         """Do nothing that takes time."""
 
+    @abstractmethod
     async def close(self) -> None:
         """Disconnect."""
-        raise NotImplementedError
 
+    @abstractmethod
     async def _connect(self) -> None:
         """Connect, and subscribe; raises `OSError` if there is no connection."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
         """Publish one message, without blocking; returns whether the network took it, and reports it if not."""
-        raise NotImplementedError
 
     def _decode(self, payload: Any) -> Decoded[ReceivedTransform]:
         """The transforms of a message; raises `MalformedMessageError`."""
