@@ -22,7 +22,8 @@ from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, ClockResetError, LocalLink, SimulatedClock, TransformStamped, from_seconds
 from tfbus.cli.arguments import UsageError
-from tfbus.cli.domain import LinkOptions, RemoteLookups, ReplayClock, is_ros, publish_static, ros_link, run
+from tfbus.cli.domain import LinkOptions, RemoteLookups, is_ros, publish_static, ros_link, run
+from tfbus.cli.replay_clock import ReplayClock
 from tfbus.links import BufferServer
 from tfbus.testing import simulate
 

@@ -6,9 +6,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from tfbus.analysis import Comparison
-from tfbus.analysis.compare import compare as compare_trees
 from tfbus.cli.arguments import CsvFlag, Duration, Flag, JsonFlag, UsageError
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import (
     Column,
     csv_name,
@@ -20,7 +19,11 @@ from tfbus.cli.output import (
     warn,
 )
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions, load_tree
-from tfbus.tree.tree import TransformTree
+
+with lazy_imports():
+    from tfbus.analysis import Comparison
+    from tfbus.analysis.compare import compare as compare_trees
+    from tfbus.tree.tree import TransformTree
 
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
 _IMPORTANCE = (6, 4, 2, 1, 3, 5)

@@ -7,11 +7,14 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from tfbus.cli.arguments import Flag, Instant, UsageError
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import format_counts, progress, say, warn, write_file
-from tfbus.recording.convert import Edits, StaticTransform
-from tfbus.recording.convert import convert as convert_recordings
-from tfbus.recording.recording import open_recording
-from tfbus.tree.rendering import quoted
+
+with lazy_imports():
+    from tfbus.recording.convert import Edits, StaticTransform
+    from tfbus.recording.convert import convert as convert_recordings
+    from tfbus.recording.recording import open_recording
+    from tfbus.tree.rendering import quoted
 
 
 def convert(

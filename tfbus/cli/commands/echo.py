@@ -7,17 +7,21 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from tfbus.buffer.buffer import Buffer
-from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError, is_number
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups, ReplayClock
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import cells, format_seconds, print_now, say, terminal_width, wrapped
-from tfbus.clock import Clock, SystemClock
-from tfbus.errors import MAY_COME, ClockResetError, InvalidTransformError, TransformLookupError
-from tfbus.frames import check_frame
-from tfbus.geometry.stamped import TransformStamped
-from tfbus.stamps import format_age, likely_cause, to_seconds
-from tfbus.waiting.live_tree import blocking_frames
+
+with lazy_imports():
+    from tfbus.buffer.buffer import Buffer
+    from tfbus.bus.bus import Bus
+    from tfbus.cli.replay_clock import ReplayClock
+    from tfbus.clock import Clock, SystemClock
+    from tfbus.errors import MAY_COME, ClockResetError, InvalidTransformError, TransformLookupError
+    from tfbus.frames import check_frame
+    from tfbus.geometry.stamped import TransformStamped
+    from tfbus.stamps import format_age, likely_cause, to_seconds
+    from tfbus.waiting.live_tree import blocking_frames
 
 _Cause = tuple[type[BaseException], tuple[str, ...]]
 

@@ -1,12 +1,15 @@
 """``tfbus foxglove``."""
 
-import anyio
-
-from tfbus._aio.web_door import WebDoor
-from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Port, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import print_now, say
+
+with lazy_imports():
+    import anyio
+
+    from tfbus._aio.web_door import WebDoor
+    from tfbus.bus.bus import Bus
 
 
 def foxglove(

@@ -8,11 +8,14 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from tfbus.cli.arguments import Flag, UsageError
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import say, track, write_file
 from tfbus.cli.recordings import load_tree, warn_of_losses
-from tfbus.errors import UnknownFrameError
-from tfbus.plain import printable
-from tfbus.recording.recording import Problems, open_recording
+
+with lazy_imports():
+    from tfbus.errors import UnknownFrameError
+    from tfbus.plain import printable
+    from tfbus.recording.recording import Problems, open_recording
 
 _KINDS = ("png", "svg", "pdf")
 

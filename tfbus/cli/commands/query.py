@@ -7,9 +7,6 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from tfbus.cli.arguments import (
     CsvFlag,
     Flag,
@@ -19,12 +16,18 @@ from tfbus.cli.arguments import (
     Step,
     UsageError,
 )
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import csv_name, csv_writer, format_seconds, say, terminal_width, track, warn, wrapped
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions, load_tree
-from tfbus.errors import DisconnectedError, pip_install
-from tfbus.recording.header_stamps import header_stamps
-from tfbus.stamps import LATEST, to_seconds
-from tfbus.tree.tree import TransformTree
+
+with lazy_imports():
+    import numpy as np
+    import numpy.typing as npt
+
+    from tfbus.errors import DisconnectedError, pip_install
+    from tfbus.recording.header_stamps import header_stamps
+    from tfbus.stamps import LATEST, to_seconds
+    from tfbus.tree.tree import TransformTree
 
 MAX_ROWS = 10_000_000
 _CHUNK = 4_096

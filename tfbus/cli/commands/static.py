@@ -5,19 +5,22 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import anyio
 from cyclopts import Parameter
 
-from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import UsageError, is_number
+from tfbus.cli.arguments import Quaternion, UsageError, Vector, is_number
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, publish_static
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import format_numbers, format_transform, say, warn
-from tfbus.errors import InvalidTransformError
-from tfbus.geometry.stamped import MAX_TRANSLATION, TransformStamped, check_translations
-from tfbus.geometry.transform import Transform
-from tfbus.recording.static_frames import load_static
-from tfbus.rows import Quaternion, Vector
-from tfbus.tf_message import refusal
+
+with lazy_imports():
+    import anyio
+
+    from tfbus.bus.bus import Bus
+    from tfbus.errors import InvalidTransformError
+    from tfbus.geometry.stamped import MAX_TRANSLATION, TransformStamped, check_translations
+    from tfbus.geometry.transform import Transform
+    from tfbus.recording.static_frames import load_static
+    from tfbus.tf_message import refusal
 
 _FILES = (".json", ".yaml", ".yml")
 

@@ -3,17 +3,20 @@
 from contextlib import AsyncExitStack
 from pathlib import Path
 
-import anyio
-
-from tfbus._aio.web_door import WebDoor
-from tfbus.buffer.buffer import Buffer
-from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Port, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, run
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import print_now, say
 from tfbus.cli.recordings import load_tree
-from tfbus.errors import InvalidRobotError, InvalidTransformError
-from tfbus.frames import check_frame
+
+with lazy_imports():
+    import anyio
+
+    from tfbus._aio.web_door import WebDoor
+    from tfbus.buffer.buffer import Buffer
+    from tfbus.bus.bus import Bus
+    from tfbus.errors import InvalidRobotError, InvalidTransformError
+    from tfbus.frames import check_frame
 
 
 def view(
