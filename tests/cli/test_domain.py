@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import anyio
 import anyio.lowlevel
@@ -76,11 +77,13 @@ def test_without_its_extra_joining_names_it(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_directory_that_others_can_enter_is_a_usage_error_that_says_what_to_do(
-    tfbus: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tfbus: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tmp_path.chmod(0o755)
-    monkeypatch.setenv("TFBUS_RUNTIME_DIR", str(tmp_path))
-    check_wrong_call(tfbus("tree"), f"other users can enter it: run chmod 700 {tmp_path}, or set TFBUS_RUNTIME_DIR")
+    # That of pytest has too long a path for a socket.
+    with TemporaryDirectory() as place:
+        Path(place).chmod(0o755)
+        monkeypatch.setenv("TFBUS_RUNTIME_DIR", place)
+        check_wrong_call(tfbus("tree"), f"other users can enter it: run chmod 700 {place}, or set TFBUS_RUNTIME_DIR")
 
 
 @pytest.mark.parametrize(
