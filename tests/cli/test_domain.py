@@ -79,7 +79,7 @@ def test_without_its_extra_joining_names_it(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_directory_that_others_can_enter_is_a_usage_error_that_says_what_to_do(
     tfbus: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # That of pytest has too long a path for a socket.
+    # The folder of pytest has too long a path for a socket.
     with TemporaryDirectory() as place:
         Path(place).chmod(0o755)
         monkeypatch.setenv("TFBUS_RUNTIME_DIR", place)

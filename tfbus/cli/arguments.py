@@ -2,7 +2,8 @@
 
 import calendar
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 from typing import Annotated, Any, Final, Literal, NamedTuple
@@ -20,6 +21,15 @@ _FRACTION = re.compile(r"(.*?)(\.\d+)?(Z|[+-]\d\d:?\d\d)?")
 
 class UsageError(Exception):
     """An argument cannot be used: the command prints the message in one line and exits with status 2."""
+
+
+@contextmanager
+def usage_errors() -> Iterator[None]:
+    """Raise a `ValueError` or an `ImportError` of the body of a ``with`` as a `UsageError` with the same message."""
+    try:
+        yield
+    except (ValueError, ImportError) as error:
+        raise UsageError(str(error)) from None
 
 
 _INSTANT = "expected seconds, or a date such as 2014-03-31T19:24:50, not {!r}"

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Protocol, TypeVar
 
 from cyclopts import Group, Parameter
 
-from tfbus.cli.arguments import Backend, UsageError
+from tfbus.cli.arguments import Backend, UsageError, usage_errors
 from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import say, warn
 
@@ -329,7 +329,7 @@ def ros_link(bus: Bus, place: str, **options: Any) -> Link:
     UsageError
         If it is none of these, or an extra is missing.
     """
-    try:
+    with usage_errors():
         if found := _DDS.fullmatch(place):
             from tfbus.links.dds import DdsLink
 
@@ -342,8 +342,6 @@ def ros_link(bus: Bus, place: str, **options: Any) -> Link:
             from tfbus.links.rosbridge import RosbridgeLink
 
             return RosbridgeLink(bus, place, **options)
-    except (ImportError, ValueError) as error:
-        raise UsageError(str(error)) from None
     raise UsageError(
         f"{place!r} is not a place of ROS: write dds, dds:42 for ROS_DOMAIN_ID 42, zenoh:host:7447, or ws://host:9090"
     )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError, is_number
+from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError, is_number, usage_errors
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups
 from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import cells, format_seconds, print_now, say, terminal_width, wrapped
@@ -17,7 +17,7 @@ with lazy_imports():
     from tfbus.bus.bus import Bus
     from tfbus.cli.replay_clock import ReplayClock
     from tfbus.clock import Clock, SystemClock
-    from tfbus.errors import MAY_COME, ClockResetError, InvalidTransformError, TransformLookupError
+    from tfbus.errors import MAY_COME, ClockResetError, TransformLookupError
     from tfbus.frames import check_frame
     from tfbus.geometry.stamped import TransformStamped
     from tfbus.stamps import format_age, likely_cause, to_seconds
@@ -66,11 +66,9 @@ def echo(
     if further:
         habit = f"tf2_echo's rate is an option: type tfbus echo {target} {source} --rate {further[0]}"
         raise UsageError(habit if is_number(further[0]) else f"expected TARGET and SOURCE, not {further[0]!r} as well")
-    try:
+    with usage_errors():
         for frame in (target, source):
             check_frame(frame)
-    except InvalidTransformError as error:
-        raise UsageError(str(error)) from None
 
     def show(transform: TransformStamped, now: int | None) -> str:
         return to_json(transform, now) if as_json else describe(transform, now, terminal_width())

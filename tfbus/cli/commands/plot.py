@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from tfbus.cli.arguments import Flag, UsageError
+from tfbus.cli.arguments import Flag, UsageError, usage_errors
 from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import say, track, write_file
 from tfbus.cli.recordings import load_tree, warn_of_losses
@@ -65,10 +65,8 @@ def plot(
     kind = None if output is None else output.suffix.removeprefix(".").lower()
     if kind is not None and kind not in _KINDS:
         raise UsageError(f"cannot draw {output}: its name must end in .png, .svg or .pdf")
-    try:
+    with usage_errors():
         from tfbus import plot as plots
-    except ImportError as error:
-        raise UsageError(str(error)) from None
     if gaps:
         problems = Problems()
         with open_recording(file) as recording:

@@ -7,7 +7,7 @@ from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
 
-from tfbus.cli.arguments import Flag, Rate, UsageError
+from tfbus.cli.arguments import Flag, Rate, UsageError, usage_errors
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, publish_static
 from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import (
@@ -93,12 +93,10 @@ def robot(
         return
     model = _read_model(file)
     positions = {**model.zeros(), **_parse_positions(model, position)}
-    try:
+    with usage_errors():
         transforms = model.transforms(positions, 0, AUTHORITY, prefix)
         check_translations(tuple(transforms), MAX_TRANSLATION)
         violations = model.violations(positions)
-    except InvalidTransformError as error:
-        raise UsageError(str(error)) from None
     for violation in violations:
         warn(str(violation))
     if tree:
