@@ -31,7 +31,8 @@ AXES = 0.3
 
 def entity(frame: str) -> str:
     """The entity of a frame, whose name may have any letters."""
-    return rr.new_entity_path(["tf", frame])
+    path: str = rr.new_entity_path(["tf", frame])
+    return path
 
 
 def draw_axes(frame: str) -> None:

@@ -10,6 +10,7 @@ scans.
 
 import asyncio
 import json
+import socket
 import subprocess
 import sys
 
@@ -18,24 +19,23 @@ import zenoh
 
 import tfbus
 
-DOMAIN, KEY = "scans-demo", "robot/scan"
-ADDRESS = "tcp/127.0.0.1:17461"
+KEY = "robot/scan"
 
 
-def open_session(side: str) -> zenoh.Session:
-    """A session that listens at the address, or connects to it, and looks for nobody else."""
+def open_session(side: str, port: str) -> zenoh.Session:
+    """A session that listens at a port of this machine, or connects to it, and looks for nobody else."""
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")
-    config.insert_json5(f"{side}/endpoints", json.dumps([ADDRESS]))
+    config.insert_json5(f"{side}/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
     return zenoh.open(config)
 
 
-async def scan_and_drive() -> None:
+async def scan_and_drive(port: str) -> None:
     """The laser's process: a wall at 5 m, from a robot that drives towards it at 1 m/s."""
-    with open_session("connect") as session, tfbus.Bus() as bus:
+    with open_session("connect", port) as session, tfbus.Bus() as bus:
         odometry = tfbus.TransformBroadcaster(bus, authority="odometry")
-        async with tfbus.LocalLink(bus, DOMAIN):
+        async with tfbus.LocalLink(bus, f"scans-{port}"):
             start = bus.clock.now()
             async for _ in bus.clock.ticks(20.0):
                 now = bus.clock.now()
@@ -45,7 +45,7 @@ async def scan_and_drive() -> None:
                 odometry.send("odom", "laser", tfbus.Transform((x, 0.0, 0.0)), at=now)
 
 
-async def place_scans(count: int) -> None:
+async def place_scans(port: str, count: int) -> None:
     """The other process: each scan in odom."""
     loop = asyncio.get_running_loop()
     scans: asyncio.Queue[tfbus.LaserScan] = asyncio.Queue(10)
@@ -60,8 +60,8 @@ async def place_scans(count: int) -> None:
         scan = tfbus.LaserScan.from_dict(json.loads(sample.payload.to_string()))
         loop.call_soon_threadsafe(keep, scan)
 
-    with open_session("listen") as session, tfbus.Bus() as bus, tfbus.Buffer(bus) as buffer:
-        async with tfbus.LocalLink(bus, DOMAIN):
+    with open_session("listen", port) as session, tfbus.Bus() as bus, tfbus.Buffer(bus) as buffer:
+        async with tfbus.LocalLink(bus, f"scans-{port}"):
             subscriber = session.declare_subscriber(KEY, receive)
             while count > 0:
                 cloud = (await scans.get()).to_points()
@@ -77,11 +77,13 @@ async def place_scans(count: int) -> None:
 
 
 if __name__ == "__main__":
-    if "laser" in sys.argv:
-        asyncio.run(scan_and_drive())
+    if len(sys.argv) > 1:
+        asyncio.run(scan_and_drive(sys.argv[1]))
     else:
-        with subprocess.Popen([sys.executable, __file__, "laser"]) as laser:
+        with socket.create_server(("127.0.0.1", 0)) as probe:
+            free = str(probe.getsockname()[1])
+        with subprocess.Popen([sys.executable, __file__, free]) as laser:
             try:
-                asyncio.run(place_scans(5))
+                asyncio.run(place_scans(free, 5))
             finally:
                 laser.terminate()

@@ -21,6 +21,7 @@ from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
 from tfbus import Bus, kernel
+from tfbus.analysis import Limits
 from tfbus.cli import run
 from tfbus.cli.application import COMMANDS, application
 from tfbus.cli.arguments import CsvFlag, Flag, JsonFlag, UsageError
@@ -37,7 +38,7 @@ def instead(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., object]]
 
 NEED = "--connect and --listen need one more package:"
 DEFAULTS = {
-    "check": "10.0 100000000.0 100.0 100.0 tf",
+    "check": f"10.0 {Limits().translation} {Limits().speed} {Limits().turn_rate} tf",
     "demo": "inf 100.0 1.0",
     "view": "8080 127.0.0.1 30.0 tf",
 }
@@ -294,6 +295,22 @@ def test_the_help_of_all_and_the_version_load_no_optional_package_and_no_numpy(o
     loaded = run_process(sys.executable, "-P", "-c", script).stdout.splitlines()[-1].split()
     assert "tfbus" in loaded
     assert set(loaded) & {"cyclopts", "rich", "zenoh", "trio", "mcap", "rosbags", "lxml", "anyio", "numpy"} == set()
+
+
+def test_the_help_of_commands_loads_none_of_their_work_which_can_be_loaded_later() -> None:
+    script = (
+        "import sys, tfbus.cli as cli\n"
+        f"for name in {sorted(COMMANDS)}: cli.run([name, '--help'])\n"
+        "print(*sys.modules)\n"
+        "cli.run(['echo', 'map'])\n"
+        "from tfbus.cli.commands.echo import describe\n"
+        "from tfbus import TransformStamped, Transform\n"
+        "print(describe(TransformStamped('map', 'base', 0, Transform.identity(), static=True), None))"
+    )
+    *_, loaded, at, _, _, _, _ = run_process(sys.executable, "-P", "-c", script).stdout.splitlines()
+    work = {"tfbus.stamps", "tfbus.bus", "tfbus.links", "tfbus.recording", "numpy", "anyio", "asyncio", "zenoh", "mcap"}
+    assert set(loaded.split()) & work == set()
+    assert at == "At any time: 'base' in 'map'"
 
 
 @pytest.mark.thorough

@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import anyio
 import anyio.lowlevel
@@ -22,7 +23,8 @@ from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, ClockResetError, LocalLink, SimulatedClock, TransformStamped, from_seconds
 from tfbus.cli.arguments import UsageError
-from tfbus.cli.domain import LinkOptions, RemoteLookups, ReplayClock, is_ros, publish_static, ros_link, run
+from tfbus.cli.domain import LinkOptions, RemoteLookups, is_ros, publish_static, ros_link, run
+from tfbus.cli.replay_clock import ReplayClock
 from tfbus.links import BufferServer
 from tfbus.testing import simulate
 
@@ -75,11 +77,13 @@ def test_without_its_extra_joining_names_it(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_directory_that_others_can_enter_is_a_usage_error_that_says_what_to_do(
-    tfbus: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tfbus: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tmp_path.chmod(0o755)
-    monkeypatch.setenv("TFBUS_RUNTIME_DIR", str(tmp_path))
-    check_wrong_call(tfbus("tree"), f"other users can enter it: run chmod 700 {tmp_path}, or set TFBUS_RUNTIME_DIR")
+    # The folder of pytest has too long a path for a socket.
+    with TemporaryDirectory() as place:
+        Path(place).chmod(0o755)
+        monkeypatch.setenv("TFBUS_RUNTIME_DIR", place)
+        check_wrong_call(tfbus("tree"), f"other users can enter it: run chmod 700 {place}, or set TFBUS_RUNTIME_DIR")
 
 
 @pytest.mark.parametrize(

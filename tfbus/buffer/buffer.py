@@ -64,8 +64,8 @@ class Buffer:
     BusClosedError
         If the bus is closed.
     ValueError
-        If `keep` is negative; if the prefix, or a shared name, is empty or starts with a slash, or a shared name
-        starts with the prefix.
+        If `keep` is negative, or finite and above 1e8; if the prefix, or a shared name, is empty or starts with a
+        slash, or a shared name starts with the prefix.
     TypeError
         If an argument is of another type, or there are shared names but no prefix.
 

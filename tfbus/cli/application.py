@@ -1,6 +1,7 @@
 """The command line: the subcommands, and their common options.
 
-`parser_of` parses the words with cyclopts, and loads the module of the one subcommand that they name.
+`parser_of` parses the words with cyclopts. It loads the module of the one subcommand that they name, and the work of
+that module only if they neither are wrong nor ask for help: see `tfbus.cli.lazy_imports`.
 """
 
 import sys
@@ -8,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Final, Literal, get_args
 
+from tfbus.cli.lazy_imports import deferring
 from tfbus.cli.statuses import USAGE_ERROR
 from tfbus.cli.version import version
 from tfbus.tf2_names import ours
@@ -72,8 +74,11 @@ def parser_of(words: Sequence[str]) -> Callable[[], _Program | None]:
     app = application(command)
 
     def parse() -> _Program | None:
-        prepare, arguments, _ = app.meta.parse_args(words, exit_on_error=False, print_error=False)
-        program: _Program | None = prepare(*arguments.args, **arguments.kwargs)
+        with deferring() as load:
+            prepare, arguments, _ = app.meta.parse_args(words, exit_on_error=False, print_error=False)
+            program: _Program | None = prepare(*arguments.args, **arguments.kwargs)
+            if program is not None:
+                load()
         return program
 
     return parse

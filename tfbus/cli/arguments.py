@@ -2,7 +2,8 @@
 
 import calendar
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 from typing import Annotated, Any, Final, Literal, NamedTuple
@@ -10,10 +11,9 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 from cyclopts import Parameter, Token
 from cyclopts.validators import Number
 
-from tfbus.stamps import SECOND, STAMP_MAX
-
-_LIMIT = Decimal(STAMP_MAX // SECOND)
-FIRST_ABSOLUTE: Final = 100_000_000 * SECOND
+_LIMIT = Decimal(2**63 // 10**9)
+"""The number of seconds that 64-bit nanoseconds can hold."""
+_FIRST_ABSOLUTE: Final = 100_000_000 * 10**9
 """The first stamp, in ns, that cannot be a time from the beginning of a recording: it is in 1973, or after 3 years."""
 _DATE = re.compile(r"\d{4}-\d\d")
 _FRACTION = re.compile(r"(.*?)(\.\d+)?(Z|[+-]\d\d:?\d\d)?")
@@ -21,6 +21,15 @@ _FRACTION = re.compile(r"(.*?)(\.\d+)?(Z|[+-]\d\d:?\d\d)?")
 
 class UsageError(Exception):
     """An argument cannot be used: the command prints the message in one line and exits with status 2."""
+
+
+@contextmanager
+def usage_errors() -> Iterator[None]:
+    """Raise a `ValueError` or an `ImportError` of the body of a ``with`` as a `UsageError` with the same message."""
+    try:
+        yield
+    except (ValueError, ImportError) as error:
+        raise UsageError(str(error)) from None
 
 
 _INSTANT = "expected seconds, or a date such as 2014-03-31T19:24:50, not {!r}"
@@ -76,7 +85,7 @@ class Time(NamedTuple):
 def parse_time(text: str) -> Time:
     """An instant from seconds or from a date.
 
-    A number below `FIRST_ABSOLUTE` counts from the beginning of the recording, a greater one is a stamp. A date is in
+    A number below 10⁸ counts from the beginning of the recording, a greater one is a stamp. A date is in
     ISO 8601, such as ``2014-03-31T19:24:50.25``, and in UTC unless it says otherwise.
 
     Raises
@@ -91,7 +100,7 @@ def parse_time(text: str) -> Time:
     nanoseconds = parse_seconds(text)
     if nanoseconds < 0:
         raise ValueError(f"expected a time from the beginning on, not {text}")
-    return Time(nanoseconds, nanoseconds >= FIRST_ABSOLUTE)
+    return Time(nanoseconds, nanoseconds >= _FIRST_ABSOLUTE)
 
 
 def _parse_date(text: str) -> int:
@@ -117,6 +126,8 @@ def _convert_step(_: Any, tokens: Sequence[Token]) -> Seconds:
     return step
 
 
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
 Backend = Literal["asyncio", "trio"]
 """An event loop."""
 Rate = Annotated[float, Parameter(validator=Number(gt=0, lt=float("inf")))]

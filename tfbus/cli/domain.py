@@ -9,32 +9,31 @@ import os
 import re
 import signal
 import sys
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Protocol, TypeVar
+from typing import Annotated, Any, Protocol, TypeVar
 
-import anyio
-import anyio.lowlevel
-from anyio.abc import TaskStatus
 from cyclopts import Group, Parameter
 
-from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import Backend, UsageError
+from tfbus.cli.arguments import Backend, UsageError, usage_errors
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import say, warn
-from tfbus.clock import Clock, JumpCallback, SimulatedClock, SystemClock
-from tfbus.errors import ClockResetError, InvalidTransformError, pip_install
-from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.link import DomainLink, DomainOptions, Link
-from tfbus.links.local import LocalLink
-from tfbus.registration import Registration
-from tfbus.stamps import SECOND, as_stamp
+
+with lazy_imports():
+    import anyio
+    from anyio.abc import TaskStatus
+
+    from tfbus.bus.bus import Bus
+    from tfbus.cli.replay_clock import ReplayClock
+    from tfbus.clock import Clock, SimulatedClock
+    from tfbus.errors import InvalidTransformError, pip_install
+    from tfbus.geometry.stamped import TransformStamped
+    from tfbus.links.link import DomainLink, DomainOptions, Link
+    from tfbus.links.local import LocalLink
 
 T = TypeVar("T")
 
-_PATIENCE: Final = 5.0
-"""The time in s to wait for a simulated clock: transforms often arrive before it, and would seem decades old."""
 _DDS = re.compile(r"dds(?::(\d{1,3}))?")
 _ZENOH = re.compile(r"zenoh:(.+:\d+)")
 _WEBSOCKET = re.compile(r"wss?://.*")
@@ -42,7 +41,6 @@ _RETRY = 1.0
 """The time between two attempts, in s."""
 _SILENCE_BEFORE_NOTICE = 1.0
 """s."""
-_NO_ZENOH = f"--connect and --listen need one more package: {pip_install('cli,zenoh')}"
 
 
 class RemoteLookups(Protocol):
@@ -245,7 +243,7 @@ class LinkOptions:
         try:
             from tfbus.links.zenoh import ZenohLink
         except ImportError:
-            raise UsageError(_NO_ZENOH) from None
+            raise UsageError(f"--connect and --listen need one more package: {pip_install('cli,zenoh')}") from None
         return ZenohLink(bus, self.domain, listen=self.listen or None, connect=self.connect or None, **options)
 
     async def first_transform(self, bus: Bus, links: Sequence[Link] = ()) -> None:
@@ -311,60 +309,6 @@ def run(main: Callable[[], Awaitable[T]], backend: str) -> T:
     return result
 
 
-class ReplayClock(SystemClock):
-    """The machine's time until the first stamp of a replay arrives, and then the newest stamp that has arrived.
-
-    So ages are counted in the time of the replay. Durations, rates and timeouts use the machine's time: a command goes
-    on while the replay is paused.
-    """
-
-    def __init__(self) -> None:
-        self._replayed: int | None = None
-        self._patient_until = time.monotonic() + _PATIENCE
-        self._arrival = anyio.Event()
-        self._callbacks: dict[object, JumpCallback] = {}
-
-    @property
-    def is_set(self) -> bool:
-        """Whether a stamp has arrived, or none has for so long that the machine's time counts."""
-        return self._replayed is not None or time.monotonic() >= self._patient_until
-
-    def now(self) -> int:
-        """The newest stamp that has arrived, or the machine's time; in ns."""
-        return super().now() if self._replayed is None else self._replayed
-
-    def hear(self, stamp: int) -> None:
-        """Take the time of the replay, in ns; an earlier one is a jump back.
-
-        The first stamp is of another clock than the time before, so it is neither earlier nor later. It is announced as
-        a jump to itself, and samples that arrived before it stay.
-        """
-        before = stamp if self._replayed is None else self._replayed
-        first, self._replayed = self._replayed is None, stamp
-        arrival, self._arrival = self._arrival, anyio.Event()
-        arrival.set()
-        if first or stamp < before:
-            for callback in tuple(self._callbacks.values()):
-                callback(before, stamp)
-
-    async def sleep_until(self, stamp: int) -> None:
-        """Sleep until a stamp in ns; `ClockResetError` after a jump back."""
-        wanted, before = as_stamp(stamp), self.now()
-        await anyio.lowlevel.checkpoint()
-        while (now := self.now()) < wanted:
-            if now < before:
-                raise ClockResetError(before=before, after=now)
-            before = now
-            with anyio.move_on_after((wanted - now) / SECOND if self._replayed is None else None):
-                await self._arrival.wait()
-
-    def on_jump(self, callback: JumpCallback) -> Registration:
-        """Call `callback` with the stamps before and after each jump."""
-        key = object()
-        self._callbacks[key] = callback
-        return Registration(lambda: self._callbacks.pop(key, None))
-
-
 def is_ros(place: str) -> bool:
     """Whether a place is one of ROS rather than a domain."""
     return any(kind.fullmatch(place) for kind in (_DDS, _ZENOH, _WEBSOCKET))
@@ -385,7 +329,7 @@ def ros_link(bus: Bus, place: str, **options: Any) -> Link:
     UsageError
         If it is none of these, or an extra is missing.
     """
-    try:
+    with usage_errors():
         if found := _DDS.fullmatch(place):
             from tfbus.links.dds import DdsLink
 
@@ -398,15 +342,13 @@ def ros_link(bus: Bus, place: str, **options: Any) -> Link:
             from tfbus.links.rosbridge import RosbridgeLink
 
             return RosbridgeLink(bus, place, **options)
-    except (ImportError, ValueError) as error:
-        raise UsageError(str(error)) from None
     raise UsageError(
         f"{place!r} is not a place of ROS: write dds, dds:42 for ROS_DOMAIN_ID 42, zenoh:host:7447, or ws://host:9090"
     )
 
 
 async def publish_static(
-    bus: Bus, samples: Sequence[TransformStamped], *, task_status: TaskStatus[None] = anyio.TASK_STATUS_IGNORED
+    bus: Bus, samples: Sequence[TransformStamped], *, task_status: TaskStatus[None] | None = None
 ) -> None:
     """Publish static samples; a refused sample is shown once, and tried again until it is accepted.
 
@@ -415,7 +357,8 @@ async def publish_static(
     """
     warned: set[str] = set()
     pending = _publish_each(bus, samples, warned)
-    task_status.started()
+    if task_status is not None:
+        task_status.started()
     while pending:
         await bus.clock.sleep(_RETRY)
         pending = _publish_each(bus, pending, warned)

@@ -19,9 +19,12 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from tfbus.cli.arguments import UsageError
-from tfbus.geometry.transform import Transform
-from tfbus.plain import printable
-from tfbus.stamps import format_duration, from_seconds
+from tfbus.cli.lazy_imports import lazy_imports
+
+with lazy_imports():
+    from tfbus.geometry.transform import Transform
+    from tfbus.plain import printable
+    from tfbus.stamps import format_duration, from_seconds
 
 ItemT = TypeVar("ItemT")
 

@@ -8,9 +8,12 @@ from typing import Any
 from cyclopts import Group, Parameter
 
 from tfbus.cli.arguments import Flag, UsageError
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import format_counts, progress, warn
-from tfbus.recording.recording import Problems, Recording, SpeedLimit, fill, open_recording
-from tfbus.tree.tree import TransformTree
+
+with lazy_imports():
+    from tfbus.recording.recording import Problems, Recording, SpeedLimit, fill, open_recording
+    from tfbus.tree.tree import TransformTree
 
 
 @Parameter(name="*", group=Group("What to read", sort_key=4))

@@ -25,7 +25,6 @@ from tfbus.geometry.stamped import (
 from tfbus.geometry.transform_array import TransformArray, from_columns, locked, with_stamps
 from tfbus.stamps import (
     LATEST,
-    SECOND,
     STAMP_MAX,
     STAMP_MIN,
     AtLike,
@@ -49,6 +48,9 @@ from tfbus.tree.rendering import counted, describe, legend, to_dot, to_html, to_
 from tfbus.tree.twist import twist, twist_many
 from tfbus.which_kernel import plain_first
 
+_LONGEST_WINDOW = 100_000_000
+"""The longest `keep` in s, about three years; a greater number was meant as nanoseconds."""
+
 
 @says_ours
 class TransformTree:
@@ -71,7 +73,8 @@ class TransformTree:
     Raises
     ------
     TypeError, ValueError
-        If `keep` is negative or NaN, or `max_translation` is not greater than zero and at most 1e100.
+        If `keep` is negative, NaN, or finite and above 1e8, or `max_translation` is not greater than zero and at most
+        1e100.
 
     Attributes
     ----------
@@ -845,13 +848,16 @@ def window_of(keep: float | None) -> int | None:
     Raises
     ------
     ValueError
-        If `keep` is negative or NaN, or does not fit 64-bit nanoseconds.
+        If `keep` is negative or NaN, or a finite number above 1e8 s, which are three years.
     """
     seconds = None if keep is None else as_duration(keep, "keep")
     if seconds is None or seconds == math.inf:
         return None
-    if seconds > STAMP_MAX / SECOND:
-        raise ValueError(f"keep must be at most 292 years, in s, got {keep!r}: nanoseconds passed as seconds?")
+    if seconds > _LONGEST_WINDOW:
+        raise ValueError(
+            f"keep must be at most {_LONGEST_WINDOW:,} s, or None for everything, got {keep!r}: "
+            "nanoseconds passed as seconds?"
+        )
     return from_seconds(seconds)
 
 

@@ -9,7 +9,7 @@ from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, LocalLink, Transform, TransformStamped
 from tfbus.cli.commands.echo import describe, to_json
-from tfbus.cli.domain import ReplayClock
+from tfbus.cli.replay_clock import ReplayClock
 from tfbus.links import BufferServer
 
 MOVING = TransformStamped(

@@ -3,13 +3,17 @@
 from dataclasses import replace
 from typing import Annotated
 
-import anyio
 from cyclopts import Parameter
 
-from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Backend, UsageError
 from tfbus.cli.domain import LinkOptions, is_ros
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import say
+
+with lazy_imports():
+    import anyio
+
+    from tfbus.bus.bus import Bus
 
 
 def bridge(

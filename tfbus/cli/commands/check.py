@@ -8,8 +8,6 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from tfbus.analysis.examiner import Examiner, Finding, Limits
-from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import (
     Duration,
     Instant,
@@ -18,13 +16,17 @@ from tfbus.cli.arguments import (
     UsageError,
 )
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import fitted, progress, say, warn
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions
 from tfbus.cli.statuses import FAILED
-from tfbus.geometry.stamped import Batch
-from tfbus.recording.examine import examine
 
-_DEFAULT = Limits()
+with lazy_imports():
+    from tfbus.analysis.examiner import Examiner, Finding, Limits
+    from tfbus.bus.bus import Bus
+    from tfbus.geometry.stamped import Batch
+    from tfbus.recording.examine import examine
+
 _SUFFIXES = (".mcap", ".bag", ".db3", ".active")
 
 
@@ -35,9 +37,9 @@ def check(
     since: Annotated[Instant | None, Parameter(name="--from")] = None,
     until: Annotated[Instant | None, Parameter(name="--to")] = None,
     duration: Duration = 10.0,
-    max_translation: Positive = _DEFAULT.translation,
-    max_speed: Positive = _DEFAULT.speed,
-    max_turn_rate: Positive = _DEFAULT.turn_rate,
+    max_translation: Positive = 1e8,
+    max_speed: Positive = 100.0,
+    max_turn_rate: Positive = 100.0,
     as_json: JsonFlag = False,
     topics: TopicOptions = DEFAULT_TOPICS,
     link: LinkOptions = DEFAULT_LINK,

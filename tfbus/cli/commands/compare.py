@@ -6,10 +6,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from tfbus.analysis import Comparison
-from tfbus.analysis.compare import compare as compare_trees
 from tfbus.cli.arguments import CsvFlag, Duration, Flag, JsonFlag, UsageError
 from tfbus.cli.commands.plot import distinct_names, draw_picture, picture_kind
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import (
     Column,
     csv_name,
@@ -20,7 +19,11 @@ from tfbus.cli.output import (
     warn,
 )
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions, load_tree
-from tfbus.tree.tree import TransformTree
+
+with lazy_imports():
+    from tfbus.analysis import Comparison
+    from tfbus.analysis.compare import compare as compare_trees
+    from tfbus.tree.tree import TransformTree
 
 _SHOWN = 5
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")

@@ -6,12 +6,15 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from tfbus.cli.arguments import Flag, Instant, UsageError
+from tfbus.cli.arguments import Flag, Instant, UsageError, usage_errors
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import format_counts, progress, say, warn, write_file
-from tfbus.recording.convert import Edits, StaticTransform
-from tfbus.recording.convert import convert as convert_recordings
-from tfbus.recording.recording import open_recording
-from tfbus.tree.rendering import quoted
+
+with lazy_imports():
+    from tfbus.recording.convert import Edits, StaticTransform
+    from tfbus.recording.convert import convert as convert_recordings
+    from tfbus.recording.recording import open_recording
+    from tfbus.tree.rendering import quoted
 
 
 def convert(
@@ -68,10 +71,8 @@ def convert(
     *inputs, output = (source, *further)
     if not inputs:
         raise UsageError("give the recordings, and at last the new file")
-    try:
+    with usage_errors():
         edits = Edits(frames or None, _pairs(rename), prefix, drop_static)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
     with open_recording(inputs[0]) as recording:
         start = recording.start
     try:

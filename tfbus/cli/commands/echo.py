@@ -7,17 +7,21 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from tfbus.buffer.buffer import Buffer
-from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError, is_number
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups, ReplayClock
+from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError, is_number, usage_errors
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import cells, print_now, say, terminal_width, wrapped
-from tfbus.clock import Clock, SystemClock
-from tfbus.errors import MAY_COME, ClockResetError, InvalidTransformError, TransformLookupError
-from tfbus.frames import check_frame
-from tfbus.geometry.stamped import TransformStamped
-from tfbus.stamps import format_age, format_seconds, likely_cause, to_seconds
-from tfbus.waiting.live_tree import blocking_frames
+
+with lazy_imports():
+    from tfbus.buffer.buffer import Buffer
+    from tfbus.bus.bus import Bus
+    from tfbus.cli.replay_clock import ReplayClock
+    from tfbus.clock import Clock, SystemClock
+    from tfbus.errors import MAY_COME, ClockResetError, TransformLookupError
+    from tfbus.frames import check_frame
+    from tfbus.geometry.stamped import TransformStamped
+    from tfbus.stamps import format_age, format_seconds, likely_cause, to_seconds
+    from tfbus.waiting.live_tree import blocking_frames
 
 _Cause = tuple[type[BaseException], tuple[str, ...]]
 
@@ -62,11 +66,9 @@ def echo(
     if further:
         habit = f"tf2_echo's rate is an option: type tfbus echo {target} {source} --rate {further[0]}"
         raise UsageError(habit if is_number(further[0]) else f"expected TARGET and SOURCE, not {further[0]!r} as well")
-    try:
+    with usage_errors():
         for frame in (target, source):
             check_frame(frame)
-    except InvalidTransformError as error:
-        raise UsageError(str(error)) from None
 
     def show(transform: TransformStamped, now: int | None) -> str:
         return to_json(transform, now) if as_json else describe(transform, now, terminal_width())

@@ -1,12 +1,15 @@
 """``tfbus foxglove``."""
 
-import anyio
-
-from tfbus._aio.web_door import WebDoor
-from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import Port, UsageError
+from tfbus.cli.arguments import Port, UsageError, usage_errors
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import print_now, say
+
+with lazy_imports():
+    import anyio
+
+    from tfbus._aio.web_door import WebDoor
+    from tfbus.bus.bus import Bus
 
 
 def foxglove(
@@ -32,15 +35,10 @@ def foxglove(
     origin
         Let pages of this other site connect too, such as https://robot.example; may be given several times.
     """
-    try:
+    with usage_errors():
         from tfbus.links.foxglove import APPLICATION, FoxgloveServer
-    except ImportError as error:
-        raise UsageError(str(error)) from None
 
-    try:
         WebDoor(host, origin)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
 
     async def serve(bus: Bus) -> None:
         server = FoxgloveServer(bus, port, host=host, origins=(*APPLICATION, *origin))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tfbus.cli.arguments import Flag, JsonFlag
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import (
     Column,
     format_counts,
@@ -18,9 +19,11 @@ from tfbus.cli.output import (
     wrapped,
 )
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions
-from tfbus.recording.recording import RecordedTopic
-from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, Spread, summarise
-from tfbus.stamps import SECOND, format_seconds
+
+with lazy_imports():
+    from tfbus.recording.recording import RecordedTopic
+    from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, Spread, summarise
+    from tfbus.stamps import SECOND, format_seconds
 
 _SPREADS = tuple(
     Column(f"{what} {value}", right=True) for what in ("period", "delay") for value in ("mean", "p99", "max")

@@ -6,18 +6,21 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
-from rich.text import Text
-
-from tfbus.analysis.arrivals import Arrival, Arrivals
-from tfbus.buffer.buffer import Buffer
-from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Positive, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import Column, format_span, print_now, table_lines, terminal_width, wrapped
-from tfbus.cli.tree_display import TreeDisplay
-from tfbus.errors import TransformLookupError
-from tfbus.stamps import from_seconds
-from tfbus.tree.tree import TransformTree
+
+with lazy_imports():
+    from rich.text import Text
+
+    from tfbus.analysis.arrivals import Arrival, Arrivals
+    from tfbus.buffer.buffer import Buffer
+    from tfbus.bus.bus import Bus
+    from tfbus.cli.tree_display import TreeDisplay
+    from tfbus.errors import TransformLookupError
+    from tfbus.stamps import from_seconds
+    from tfbus.tree.tree import TransformTree
 
 # The least important column has the lowest number.
 _COLUMNS = (

@@ -10,19 +10,23 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import anyio
 from cyclopts import Parameter
 
-from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Flag, Instant, Speed, Time, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import format_counts, progress_bar, say, warn
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions
 from tfbus.cli.statuses import ENDED_BY_SIGNAL
-from tfbus.clock import SimulatedClock
-from tfbus.events import PeerJoined
-from tfbus.recording.player import Player
-from tfbus.stamps import to_seconds
+
+with lazy_imports():
+    import anyio
+
+    from tfbus.bus.bus import Bus
+    from tfbus.clock import SimulatedClock
+    from tfbus.events import PeerJoined
+    from tfbus.recording.player import Player
+    from tfbus.stamps import to_seconds
 
 try:
     import termios

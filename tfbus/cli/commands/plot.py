@@ -7,12 +7,15 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from tfbus.cli.arguments import Flag, UsageError
+from tfbus.cli.arguments import Flag, UsageError, usage_errors
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import say, track, write_file
 from tfbus.cli.recordings import load_tree, warn_of_losses
-from tfbus.errors import UnknownFrameError
-from tfbus.plain import printable
-from tfbus.recording.recording import Problems, open_recording
+
+with lazy_imports():
+    from tfbus.errors import UnknownFrameError
+    from tfbus.plain import printable
+    from tfbus.recording.recording import Problems, open_recording
 
 _KINDS = ("png", "svg", "pdf")
 
@@ -119,10 +122,8 @@ def picture_kind(output: Path) -> str:
 
 
 def _plots() -> Any:
-    try:
+    with usage_errors():
         from tfbus import plot
-    except ImportError as error:
-        raise UsageError(str(error)) from None
     return plot
 
 

@@ -7,9 +7,6 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from tfbus.cli.arguments import (
     CsvFlag,
     Flag,
@@ -19,19 +16,26 @@ from tfbus.cli.arguments import (
     Step,
     UsageError,
 )
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import csv_name, csv_writer, say, terminal_width, track, warn, wrapped
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions, load_tree
-from tfbus.errors import DisconnectedError, pip_install
-from tfbus.geometry.transform_array import COLUMN_NAMES
-from tfbus.recording.formats import trajectories
-from tfbus.recording.header_stamps import header_stamps
-from tfbus.rows import Quaternion, Vector
-from tfbus.stamps import LATEST, format_seconds, to_seconds
-from tfbus.tree.tree import TransformTree, moving_edges
+
+with lazy_imports():
+    import numpy as np
+    import numpy.typing as npt
+
+    from tfbus.errors import DisconnectedError, pip_install
+    from tfbus.geometry.transform_array import COLUMN_NAMES
+    from tfbus.recording.formats import trajectories
+    from tfbus.recording.header_stamps import header_stamps
+    from tfbus.rows import Quaternion, Vector
+    from tfbus.stamps import LATEST, format_seconds, to_seconds
+    from tfbus.tree.tree import TransformTree, moving_edges
 
 MAX_ROWS = 10_000_000
 _CHUNK = 4_096
 Format = Literal["table", "csv", "json", "tum", "kitti", "euroc"]
+_TRAJECTORIES: tuple[Format, ...] = ("tum", "kitti", "euroc")
 _BLOCK = 65_536
 _STAMP, _NUMBER = 20, 12
 """The widths of a stamp and of a number in a table."""
@@ -265,8 +269,9 @@ def _print_json(rows: Iterator[Row], _: bool) -> None:
         print(json.dumps({**row._asdict(), "stamp": format_seconds(row.stamp)}))
 
 
-def _print_trajectory(kind: trajectories.Format) -> Callable[[Iterator[Row], bool], None]:
+def _print_trajectory(name: Format) -> Callable[[Iterator[Row], bool], None]:
     def print_lines(rows: Iterator[Row], _: bool) -> None:
+        kind = (trajectories.TUM, trajectories.KITTI, trajectories.EUROC)[_TRAJECTORIES.index(name)]
         for line in trajectories.lines_of(((row.stamp, (*row.translation, *row.rotation)) for row in rows), kind):
             print(line)
 
@@ -295,14 +300,9 @@ def _number(value: float) -> str:
     return text if len(text) <= _NUMBER else f" {value:{_NUMBER - 1}.4e}"
 
 
-_TRAJECTORIES: dict[Format, trajectories.Format] = {
-    "tum": trajectories.TUM,
-    "kitti": trajectories.KITTI,
-    "euroc": trajectories.EUROC,
-}
 _PRINTERS: dict[Format, Callable[[Iterator[Row], bool], None]] = {
     "table": _print_table,
     "csv": _print_csv,
     "json": _print_json,
-    **{name: _print_trajectory(kind) for name, kind in _TRAJECTORIES.items()},
+    **{name: _print_trajectory(name) for name in _TRAJECTORIES},
 }

@@ -8,17 +8,20 @@ from collections.abc import AsyncIterator
 from contextlib import AbstractContextManager, AsyncExitStack
 from pathlib import Path
 
-import anyio
-
-from tfbus.bus.bus import Bus
-from tfbus.bus.event_stream import EventStream
 from tfbus.cli.arguments import Duration, Flag, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import format_counts, say, warn
 from tfbus.cli.statuses import ENDED_BY_SIGNAL, FAILED
-from tfbus.events import RecordingDropped, RecordingFailed
-from tfbus.recording.recorder import Recorder
-from tfbus.statistics import RecorderStatistics
+
+with lazy_imports():
+    import anyio
+
+    from tfbus.bus.bus import Bus
+    from tfbus.bus.event_stream import EventStream
+    from tfbus.events import RecordingDropped, RecordingFailed
+    from tfbus.recording.recorder import Recorder
+    from tfbus.statistics import RecorderStatistics
 
 
 def record(

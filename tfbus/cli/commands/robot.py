@@ -7,11 +7,9 @@ from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
 
-import anyio
-
-from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import Flag, Rate, UsageError
+from tfbus.cli.arguments import Flag, Rate, UsageError, usage_errors
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, publish_static
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import (
     Column,
     cells,
@@ -24,14 +22,19 @@ from tfbus.cli.output import (
     terminal_width,
     warn,
 )
-from tfbus.errors import InvalidRobotError, InvalidTransformError
-from tfbus.geometry.stamped import MAX_TRANSLATION, check_translations
-from tfbus.geometry.transform import Transform
-from tfbus.plain import printable
-from tfbus.robot.model import Joint, Position, RobotModel
-from tfbus.robot.state_publisher import RobotStatePublisher
-from tfbus.tree.history import Edge
-from tfbus.tree.rendering import Branch, branches
+
+with lazy_imports():
+    import anyio
+
+    from tfbus.bus.bus import Bus
+    from tfbus.errors import InvalidRobotError, InvalidTransformError
+    from tfbus.geometry.stamped import MAX_TRANSLATION, check_translations
+    from tfbus.geometry.transform import Transform
+    from tfbus.plain import printable
+    from tfbus.robot.model import Joint, Position, RobotModel
+    from tfbus.robot.state_publisher import RobotStatePublisher
+    from tfbus.tree.history import Edge
+    from tfbus.tree.rendering import Branch, branches
 
 AUTHORITY = "robot"
 _ALIKE = 0.7
@@ -90,12 +93,10 @@ def robot(
         return
     model = _read_model(file)
     positions = {**model.zeros(), **_parse_positions(model, position)}
-    try:
+    with usage_errors():
         transforms = model.transforms(positions, 0, AUTHORITY, prefix)
         check_translations(tuple(transforms), MAX_TRANSLATION)
         violations = model.violations(positions)
-    except InvalidTransformError as error:
-        raise UsageError(str(error)) from None
     for violation in violations:
         warn(str(violation))
     if tree:

@@ -3,12 +3,15 @@
 import os
 from pathlib import Path
 
-import anyio
-
 from tfbus.cli.arguments import Backend, UsageError
 from tfbus.cli.domain import run
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import say
-from tfbus.errors import pip_install
+
+with lazy_imports():
+    import anyio
+
+    from tfbus.errors import pip_install
 
 
 def router(

@@ -5,19 +5,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import anyio
 from cyclopts import Parameter
 
-from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import UsageError, is_number
+from tfbus.cli.arguments import Quaternion, UsageError, Vector, is_number, usage_errors
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, publish_static
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import format_numbers, format_transform, say, warn
-from tfbus.errors import InvalidTransformError
-from tfbus.geometry.stamped import MAX_TRANSLATION, TransformStamped, check_translations
-from tfbus.geometry.transform import Transform
-from tfbus.recording.static_frames import load_static
-from tfbus.rows import Quaternion, Vector
-from tfbus.tf_message import refusal
+
+with lazy_imports():
+    import anyio
+
+    from tfbus.bus.bus import Bus
+    from tfbus.geometry.stamped import MAX_TRANSLATION, TransformStamped, check_translations
+    from tfbus.geometry.transform import Transform
+    from tfbus.recording.static_frames import load_static
+    from tfbus.tf_message import refusal
 
 _FILES = (".json", ".yaml", ".yml")
 
@@ -104,10 +106,8 @@ def _check_habits(words: Sequence[str]) -> None:
 def _from_file(file: Path, authority: str) -> list[TransformStamped]:
     if file.suffix not in _FILES and not file.exists():
         raise UsageError(f"CHILD is missing: tfbus static {file} CHILD, or a file that ends in {' or '.join(_FILES)}")
-    try:
+    with usage_errors():
         samples = load_static(file, authority=authority)
-    except ImportError as error:
-        raise UsageError(str(error)) from None
     if not samples:
         raise UsageError(f"there is no transform in {file}")
     for sample in samples:
@@ -120,7 +120,7 @@ def _transform(xyz: Vector, rpy: Vector | None, rpy_deg: Vector | None, quaterni
     names = [name for name, value in given.items() if value is not None]
     if len(names) > 1:
         raise UsageError(f"{' and '.join(names)} are ways to say the same: give one of them")
-    try:
+    with usage_errors():
         if quaternion is not None:
             return Transform(xyz, quaternion)
         angles: Sequence[float] = (0.0, 0.0, 0.0) if rpy is None else rpy
@@ -129,24 +129,18 @@ def _transform(xyz: Vector, rpy: Vector | None, rpy_deg: Vector | None, quaterni
         elif any(math.inf > abs(angle) > 2 * math.pi for angle in angles):
             warn(f"--rpy {format_numbers(angles)} is in rad and more than a turn: are these degrees, for --rpy-deg?")
         return Transform.from_xyz_rpy(xyz, angles)
-    except InvalidTransformError as error:
-        raise UsageError(str(error)) from None
 
 
 def _sample(parent: str, child: str, transform: Transform, authority: str) -> TransformStamped:
-    try:
+    with usage_errors():
         sample = TransformStamped(parent, child, 0, transform, authority, static=True)
-    except InvalidTransformError as error:
-        raise UsageError(str(error)) from None
     _check(sample)
     return sample
 
 
 def _check(sample: TransformStamped) -> None:
-    try:
+    with usage_errors():
         check_translations((sample,), MAX_TRANSLATION)
-    except InvalidTransformError as error:
-        raise UsageError(str(error)) from None
     unsendable = refusal(sample)
     if unsendable is not None:
         raise UsageError(str(unsendable))

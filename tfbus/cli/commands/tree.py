@@ -6,21 +6,25 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import anyio.to_thread
-
-from tfbus.analysis.arrivals import Delays
-from tfbus.buffer.buffer import Buffer
-from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, ReplayClock
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import print_now, say, write_file
 from tfbus.cli.recordings import DEFAULT_TOPICS, TopicOptions, load_tree
-from tfbus.cli.tree_display import TreeDisplay
-from tfbus.links.link import Link
-from tfbus.stamps import to_seconds
-from tfbus.tree.history import Edge
-from tfbus.tree.rendering import to_dot
-from tfbus.tree.tree import TransformTree
+
+with lazy_imports():
+    import anyio.to_thread
+
+    from tfbus.analysis.arrivals import Delays
+    from tfbus.buffer.buffer import Buffer
+    from tfbus.bus.bus import Bus
+    from tfbus.cli.replay_clock import ReplayClock
+    from tfbus.cli.tree_display import TreeDisplay
+    from tfbus.links.link import Link
+    from tfbus.stamps import to_seconds
+    from tfbus.tree.history import Edge
+    from tfbus.tree.rendering import to_dot
+    from tfbus.tree.tree import TransformTree
 
 _LEAST_DURATION, _LONGEST_DURATION = 1.0, 5.0
 _LOOK_AGAIN = 0.1

@@ -9,24 +9,26 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-import anyio
-
-from tfbus.buffer.buffer import Buffer
-from tfbus.bus.broadcaster import TransformBroadcaster
-from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Backend, Duration, Flag, Rate
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, ReplayClock, run
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, run
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import fitted, print_now, say
-from tfbus.clock import Clock, SimulatedClock, SystemClock
-from tfbus.data import PointStamped
-from tfbus.errors import TransformError
-from tfbus.geometry.transform import Transform
-from tfbus.rows import Vector
-from tfbus.stamps import LATEST, format_seconds, to_seconds
+
+with lazy_imports():
+    import anyio
+
+    from tfbus.buffer.buffer import Buffer
+    from tfbus.bus.broadcaster import TransformBroadcaster
+    from tfbus.bus.bus import Bus
+    from tfbus.cli.replay_clock import ReplayClock
+    from tfbus.clock import Clock, SimulatedClock, SystemClock
+    from tfbus.data import PointStamped
+    from tfbus.errors import TransformError
+    from tfbus.geometry.transform import Transform
+    from tfbus.stamps import LATEST, format_seconds, to_seconds
 
 BASE, LASER = "base_link", "base_laser"
-BASE_FROM_LASER = Transform((0.1, 0.0, 0.2))
-POINT: Vector = (1.0, 0.2, 0.0)
+POINT = (1.0, 0.2, 0.0)
 
 Print = Callable[[str], object]
 
@@ -119,8 +121,9 @@ async def send_laser(bus: Bus, rate: float = 100.0) -> None:
     the next one is sent all the same.
     """
     broadcaster = TransformBroadcaster(bus, authority="robot_tf_publisher", invalid="drop")
+    base_from_laser = Transform((0.1, 0.0, 0.2))
     async for _ in bus.clock.ticks(rate):
-        broadcaster.send(BASE, LASER, BASE_FROM_LASER)
+        broadcaster.send(BASE, LASER, base_from_laser)
 
 
 async def transform_points(

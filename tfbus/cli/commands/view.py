@@ -3,17 +3,20 @@
 from contextlib import AsyncExitStack
 from pathlib import Path
 
-import anyio
-
-from tfbus._aio.web_door import WebDoor
-from tfbus.buffer.buffer import Buffer
-from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import Port, Rate, UsageError
+from tfbus.cli.arguments import Port, Rate, UsageError, usage_errors
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, run
+from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import print_now, say
 from tfbus.cli.recordings import load_tree
-from tfbus.errors import InvalidRobotError, InvalidTransformError
-from tfbus.frames import check_frame
+
+with lazy_imports():
+    import anyio
+
+    from tfbus._aio.web_door import WebDoor
+    from tfbus.buffer.buffer import Buffer
+    from tfbus.bus.bus import Bus
+    from tfbus.errors import InvalidRobotError
+    from tfbus.frames import check_frame
 
 
 def view(
@@ -57,20 +60,12 @@ def view(
     rate
         Draw at most this many times per second.
     """
-    try:
+    with usage_errors():
         from tfbus.view import View
-    except ImportError as error:
-        raise UsageError(str(error)) from None
-    try:
+
         for frame in trail if fixed is None else (*trail, fixed):
             check_frame(frame)
-    except InvalidTransformError as error:
-        raise UsageError(str(error)) from None
-
-    try:
         WebDoor(host, origin)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
 
     async def show(bus: Bus, buffer: Buffer, live: bool) -> None:
         page = View(

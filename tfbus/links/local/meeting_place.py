@@ -121,11 +121,14 @@ class MeetingPlace:
         return self._listen()
 
     def _listen(self) -> socket.socket:
-        make_private(self._directory)
         path = self._directory / self.name
-        if not self.loopback and len(os.fsencode(path)) > LONGEST_PATH:
-            shorter = f"set TFBUS_RUNTIME_DIR to a path shorter than {self._directory}"
-            raise OSError(errno.ENAMETOOLONG, f"the path of a socket would be too long: {shorter}")
+        length = len(os.fsencode(path))
+        if not self.loopback and length > LONGEST_PATH:
+            raise OSError(
+                f"the path of a socket may have {LONGEST_PATH} bytes, and {path} is {length} and too long: "
+                "set TFBUS_RUNTIME_DIR to a shorter path"
+            )
+        make_private(self._directory)
         listener = self._socket()
         try:
             listener.bind(("127.0.0.1", 0) if self.loopback else str(path))
