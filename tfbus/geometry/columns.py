@@ -5,6 +5,7 @@ cannot be a sample raises the error that it would raise alone.
 """
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any, TypeAlias, cast
 
 import numpy as np
@@ -76,8 +77,11 @@ class SampleColumns:
         self._authority = str(authority)
         self._static = bool(static)
         self._bound = max_translation
+        self._make_plain()
+
+    def _make_plain(self) -> None:
         # A square this near to the bound can disagree with the length.
-        square = 0.99 * max_translation**2
+        square = 0.99 * self._bound**2
         self.plain = columns(
             self._parents, self._children, self._stamps, self._rows, self._authority, self._static, square
         )
@@ -86,17 +90,11 @@ class SampleColumns:
         return len(self._stamps)
 
     def part(self, rows: slice) -> "SampleColumns":
-        """Some of the rows; for all of them, parents and children have one name."""
-        return SampleColumns(
-            cast(str, self._parents),
-            cast(str, self._children),
-            self._stamps[rows],
-            self._rows[rows, :3],
-            self._rows[rows, 3:],
-            self._authority,
-            self._static,
-            self._bound,
-        )
+        """Some of the rows, which share the memory of all; for all of them, parents and children have one name."""
+        part = copy(self)
+        part._rows, part._stamps = self._rows[rows], self._stamps[rows]
+        part._make_plain()
+        return part
 
     def samples(self, refuse: Callable[[InvalidTransformError], object] | None = None) -> Batch:
         """The samples as objects, in order.

@@ -91,6 +91,9 @@ def test_a_line_that_is_no_pose_is_left_out_and_reported_with_its_number(tmp_pat
         assert problems.details == [
             f"line 3: expected stamp x y z qx qy qz qw, a unit quaternion; got {bad!r}",
         ]
+    path.write_text("1 2 3 0 0 0 1 0\n" + "x\n" * 3_000)
+    load(path, problems=(problems := Problems()))
+    assert problems == {"damaged": 1_001}
     path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 2 0 0 0 0 1 0\n")
     load(path, problems=(problems := Problems()))
     assert problems.details[0].startswith(

@@ -29,11 +29,11 @@ from tfbus.recording.formats.storage import (
     StoredMessage,
     Wanted,
     in_order,
+    lost_message,
 )
 from tfbus.recording.formats.transforms import RawTransform, holds_transforms, parser_of, write_cdr
 from tfbus.rows import NORM_TOLERANCE, Row
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, format_seconds
-from tfbus.tf_message import MalformedMessageError
 
 PARENT: Final = "map"
 CHILD: Final = "base_link"
@@ -44,6 +44,8 @@ _SHOWN: Final = 60
 _BLOCK: Final = 2**16
 """The number of poses that are decoded at once."""
 _MOST_NAMES: Final = 5
+_MOST_REPORTS: Final = 1_000
+"""The number of wrong lines that are reported one by one."""
 _KITTI_PERIOD: Final = SECOND // 10
 _LIMIT: Final = 2**31 * SECOND
 """The seconds of a stamp of a message have 32 bits."""
@@ -196,17 +198,18 @@ class TrajectoryStorage:
     def close(self) -> None:
         """Nothing: the file is closed already."""
 
-    def _lose(self, number: int, why: str) -> None:
-        self._lost.append((0, MalformedMessageError("damaged", f"line {number}: {why}"), b""))
+    def _lose(self, why: str) -> None:
+        self._lost.append(lost_message(0, why))
 
     def _read(self, file: BinaryIO, path: Path) -> tuple[Format, Any, Any]:
         """The format, the stamps in ns, and the transforms, shape (n, 7)."""
         kind: Format | None = None
-        stamps, values, numbers = array("q"), array("d"), array("q")
+        stamps, values = array("q"), array("d")
+        wrong = 0
         for number, line in enumerate(iter(lambda: file.readline(MAX_LINE + 1), b""), 1):
             if len(line) > MAX_LINE or len(stamps) == MAX_POSES:
                 most = f"a line has at most {MAX_LINE:,} bytes, and a file {MAX_POSES:,} poses"
-                self._lose(number, f"it is not read from here on: {most}")
+                self._lose(f"line {number}: it is not read from here on: {most}")
                 break
             line = line.strip()
             if not line or line.startswith(b"#"):
@@ -228,11 +231,14 @@ class TrajectoryStorage:
                 if not -_LIMIT <= stamp < _LIMIT:
                     raise ValueError
             except (ValueError, InvalidTransformError):
-                self._lose(number, f"expected {kind.expected}; got {_shown(line)}")
+                wrong += 1
+                if wrong <= _MOST_REPORTS:
+                    self._lose(f"line {number}: expected {kind.expected}; got {_shown(line)}")
                 continue
             stamps.append(stamp)
             values.extend((x, y, z, qx, qy, qz, qw))
-            numbers.append(number)
+        if wrong > _MOST_REPORTS:
+            self._lose(f"{wrong - _MOST_REPORTS:,} more lines are no poses")
         if kind is None:
             raise RecordingError("there is no line but comments", path=str(path), reason="empty")
         return kind, np.array(stamps, np.int64), np.array(values).reshape(-1, 7)
