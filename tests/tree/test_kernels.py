@@ -590,14 +590,6 @@ def known_edges(kernel: Any) -> dict[str, Any]:
     return made
 
 
-def judge(kernel: Any, known_edges: dict[str, Any], batch: Any, horizon: int, square: float) -> bool:
-    judge = kernel.Judge(known_edges, square)
-    assert judge.horizon == STAMP_MIN
-    judge.horizon = horizon
-    accepted: bool = judge.accepts(batch)
-    return accepted
-
-
 def judged_sample(kernel: ModuleType, *, child: str = "a", stamp: int = 20, x: float = 1.0, **other: Any) -> Any:
     """A sample 9 m away if x is 1 m."""
     row = (x, 4.0, 8.0, 0.0, 0.0, 0.0, 1.0)
@@ -649,6 +641,16 @@ def run(wanted: str | None, script: str = SHOW) -> subprocess.CompletedProcess[s
 
 def test_python_is_the_twin() -> None:
     assert run("python").stdout.split() == ["python", "tfbus._python_kernel"]
+
+
+@needs_both
+def test_trees_and_buses_are_as_their_models_say_on_the_python_kernel_too() -> None:
+    tests = Path(__file__).parents[1]
+    models = ("tree/test_tree_model.py", "stress/test_bus_oracle.py", "bus/test_columns.py", "bus/test_topology.py")
+    command = [sys.executable, "-P", "-m", "pytest", "-q", "-x", "-n0", *(str(tests / model) for model in models)]
+    environment = {**os.environ, "TFBUS_KERNEL": "python"}
+    done = subprocess.run(command, env=environment, cwd=tests.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
 
 
 WITHOUT = "import sys; sys.modules['tfbus._kernel'] = None\n"
