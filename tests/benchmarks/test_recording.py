@@ -4,6 +4,7 @@ import json
 import math
 import os
 import subprocess
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -157,3 +158,17 @@ def test_a_million_transforms(table: Table, write: Write, command: str, question
     process.returncode = os.waitstatus_to_exitcode(status)
     assert process.returncode == 0
     table.add(f"{command}, a million transforms", f"{seconds:.1f} s, {memory:.0f} MB", wanted=wanted)
+
+
+@pytest.mark.parametrize(("words", "wanted"), [("--version", "<= 50 ms"), ("tree --help", "<= 250 ms")])
+def test_the_start_of_the_command(table: Table, words: str, wanted: str) -> None:
+    def start(*command: str) -> float:
+        """The seconds of the processor that it takes to run a command."""
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        assert process.returncode == 0
+        return usage.ru_utime + usage.ru_stime
+
+    ours, bare = take_turns(partial(start, TFBUS, *words.split()), partial(start, sys.executable, "-c", "pass"))
+    table.compare(f"tfbus {words}", ours, "bare Python", bare, wanted, "ms")
