@@ -47,7 +47,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "view": ("buffer", "recording", "robot"),
     "plot": ("recording",),
     "testing": ("geometry",),
-    "__init__": ("links", "message_filter", "recording", "testing"),
+    "web": (),
+    "__init__": ("links", "message_filter", "recording", "testing", "web"),
     "cli": ("__init__", "links", "plot", "view"),
     "__main__": ("cli",),
 }
@@ -81,7 +82,7 @@ EXTRAS = {
     "zenoh": ("links.rmw_zenoh", "links.zenoh"),
     "zstandard": ("recording.formats",),
 }
-NEVER_LOADED = {*EXTRAS, "hypothesis", "starlette", "uvicorn"}
+NEVER_LOADED = {*EXTRAS, "fastapi", "hypothesis", "starlette", "uvicorn"}
 
 
 def module_name(path: Path) -> str:

@@ -5,6 +5,7 @@ from tfbus import data as data
 from tfbus import recording as recording
 from tfbus import robot as robot
 from tfbus import testing as testing
+from tfbus import web as web
 from tfbus.analysis.examiner import Finding as Finding
 from tfbus.analysis.examiner import diagnose as diagnose
 from tfbus.buffer.buffer import Buffer as Buffer
