@@ -2,16 +2,17 @@
 
 The bus, the buffer and a robot that drives in a circle live in the application's lifespan. The routes are
 
-    GET /                                           a page that shows the tree and follows the robot
-    GET /tree                                       the tree as text
-    GET /transforms/map/base_link                   the newest
-    GET /transforms/map/base_link?at=1250000000     at a stamp, in ns
-    GET /transforms/map/base_link?timeout=0.2       waits no longer than 0.2 s (by default 1 s, at most 60 s)
-    GET /changes/map/base_link                      Server-Sent Events: each change, at most 10 in a second
-    WebSocket /poses/map/base_link                  each change, at most 20 in a second
+    GET /                                                a page that shows the tree and follows the robot
+    GET /tree                                            the tree as text
+    GET /transforms/robot1/laser                         the newest, in the frame map
+    GET /transforms/robot1/laser?target=robot1/base_link another target
+    GET /transforms/robot1/laser?at=1250000000           at a stamp, in ns
+    GET /transforms/robot1/laser?timeout=0.2             waits no longer than 0.2 s (by default 1 s, at most 60 s)
+    GET /changes/robot1/laser                            Server-Sent Events: each change, at most 10 in a second
+    WebSocket /poses/robot1/laser                        each change, at most 20 in a second
 
-A lookup answers 200 with JSON, 404 with close matches for a frame that nobody has published, 504 with the reason when
-the time is up, 400 for a question that can never be answered, and 503 while the service is going down.
+`tfbus.web.status_of` gives the statuses of errors: 404 for a frame that nobody has published, 504 when the time is up,
+503 while the service ends. A WebSocket closes with 4404 for 404. A signal ends all streams and waits at once.
 
 A browser connects to this machine for any web page. So the service answers to its own names only (`HOSTS`), and opens a
 WebSocket only for its own pages and the pages of `ORIGINS`.
@@ -22,17 +23,16 @@ Run it with `pip install ".[web]"`, then `python demos/web_app.py`, and open htt
 import contextlib
 import json
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
+from typing import Annotated, Any
 
 import anyio
+import fastapi
 import uvicorn
-from starlette.applications import Starlette
-from starlette.middleware import Middleware
+from fastapi.requests import HTTPConnection
+from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse, StreamingResponse
+from fastapi.websockets import WebSocketDisconnect
 from starlette.middleware.trustedhost import TrustedHostMiddleware
-from starlette.requests import HTTPConnection, Request
-from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
-from starlette.routing import Route, WebSocketRoute
-from starlette.websockets import WebSocket, WebSocketDisconnect
 
 import tfbus
 
@@ -46,32 +46,78 @@ LONGEST_WAIT = 60.0
 PAGE = """<!doctype html>
 <html lang="en">
 <meta charset="utf-8">
-<title>tfbus</title>
-<style>body { font-family: sans-serif } canvas { border: 1px solid gray }</style>
-<h1>Where is the robot?</h1>
-<canvas id="map" width="300" height="300"></canvas>
-<p>Laser in the map: <output id="laser">waiting</output></p>
-<pre id="tree"></pre>
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Where is the robot?</title>
+<link rel="icon" href="data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 16 16' stroke-width='3'
+  stroke-linecap='round'><path d='M3 13h10' stroke='%23d33'/><path d='M3 13V3' stroke='%232a2'/></svg>">
+<style>
+:root { color-scheme: light dark; --line: light-dark(#d5dae2, #39414e); --soft: light-dark(#5b6573, #9aa5b5);
+  --card: light-dark(#fff, #1c2129); --robot: light-dark(#1663c7, #6fb0ff) }
+body { margin: 0 auto; padding: 1.5rem; max-width: 60rem; font: 1rem/1.5 system-ui, sans-serif;
+  background: light-dark(#f4f6f9, #13171d) }
+header { display: flex; flex-wrap: wrap; gap: .25rem 1rem; align-items: baseline; margin-bottom: 1rem }
+h1 { font-size: 1.5rem; margin: 0 }
+h2 { font-size: .8rem; font-weight: 600; color: var(--soft); margin: 0 0 .5rem }
+main { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(min(20rem, 100%), 1fr)) }
+section { align-self: start; min-width: 0; padding: 1rem;
+  background: var(--card); border: 1px solid var(--line); border-radius: .6rem }
+section.wide { grid-column: 1 / -1 }
+#map { width: 100%; aspect-ratio: 1; max-height: 24rem; display: block }
+#grid { stroke: var(--line) } #map circle { fill: none; stroke: var(--line); stroke-dasharray: .04 }
+#map, dd { font-variant-numeric: tabular-nums }
+dl { display: grid; grid-template-columns: auto 1fr; gap: .2rem 1rem; margin: 0 }
+dt { color: var(--soft) } dd { margin: 0; text-align: right }
+pre { margin: 0; overflow-x: auto; font: .85rem/1.5 ui-monospace, monospace }
+#state { color: var(--soft) } #state.lost { color: #c0392b; font-weight: 600 }
+</style>
+<header><h1>Where is the robot?</h1><span id="state" role="status">connecting</span></header>
+<main>
+<section><h2>map, from above; the grid is 0.5 m</h2>
+<svg id="map" viewBox="-1.5 -1.5 3 3" stroke-width=".01" role="img" aria-label="The robot in the map">
+<g id="grid"></g><circle r="1"/>
+<path id="robot" fill="var(--robot)" d="M.16 0 -.1 .1 -.05 0 -.1-.1Z" visibility="hidden"/></svg></section>
+<section><h2>robot1/laser in map</h2>
+<dl><dt>x</dt><dd id="x">–</dd><dt>y</dt><dd id="y">–</dd><dt>z</dt><dd id="z">–</dd>
+<dt>stamp</dt><dd id="stamp">–</dd></dl></section>
+<section class="wide"><h2>all frames</h2><pre id="tree"></pre></section>
+</main>
 <script>
-const map = document.getElementById("map").getContext("2d");
-const pixel = ([x, y]) => [150 + 100 * x, 150 - 100 * y];
-const poses = new WebSocket(`ws://${location.host}/poses/map/base_link`);
-poses.onmessage = (message) => {
-  const { translation } = JSON.parse(message.data).transform;
-  const [x, y] = pixel(translation);
-  map.clearRect(0, 0, 300, 300);
-  map.fillRect(x - 5, y - 5, 10, 10);
+const element = (id) => document.getElementById(id);
+for (let at = -1.5; at <= 1.5; at += 0.5)
+  element("grid").innerHTML += `<path d="M${at} -2V2M-2 ${at}H2"/>`;
+
+const lost = new Set();
+const report = (stream, isOpen) => {
+  isOpen ? lost.delete(stream) : lost.add(stream);
+  element("state").className = lost.size ? "lost" : "";
+  element("state").textContent = lost.size ? "connection lost, reconnecting" : "live";
 };
-const changes = new EventSource("/changes/map/laser");
-changes.onmessage = (message) => {
-  const { translation } = JSON.parse(message.data).transform;
-  document.getElementById("laser").value = translation.map((metres) => metres.toFixed(2)).join(", ");
+const followRobot = () => {
+  const poses = new WebSocket(`${location.protocol.replace("http", "ws")}//${location.host}/poses/robot1/base_link`);
+  poses.onopen = () => report("poses", true);
+  poses.onclose = () => { report("poses", false); setTimeout(followRobot, 1000); };
+  poses.onmessage = (message) => {
+    const { translation: [x, y], rotation: [, , qz, qw] } = JSON.parse(message.data).transform;
+    const heading = -2 * Math.atan2(qz, qw) * 180 / Math.PI;
+    element("robot").setAttribute("transform", `translate(${x} ${-y}) rotate(${heading})`);
+    element("robot").setAttribute("visibility", "visible");
+  };
+};
+const followLaser = () => {
+  const changes = new EventSource("/changes/robot1/laser");
+  changes.onopen = () => report("changes", true);
+  changes.onerror = () => { changes.close(); report("changes", false); setTimeout(followLaser, 1000); };
+  changes.onmessage = (message) => {
+    const { stamp, transform: { translation } } = JSON.parse(message.data);
+    ["x", "y", "z"].forEach((axis, i) => { element(axis).textContent = `${translation[i].toFixed(2)} m`; });
+    element("stamp").textContent = new Date(stamp / 1e6).toLocaleTimeString();
+  };
 };
 const showTree = async () => {
-  document.getElementById("tree").textContent = await (await fetch("/tree")).text();
+  try { element("tree").textContent = await (await fetch("/tree")).text(); } catch { /* the streams report it */ }
+  setTimeout(showTree, 1000);
 };
-showTree();
-setInterval(showTree, 1000);
+followRobot(); followLaser(); showTree();
 </script>
 </html>
 """
@@ -84,95 +130,102 @@ async def drive(bus: tfbus.Bus) -> None:
         angle = 0.5 * tick / 50.0
         position = (math.cos(angle), math.sin(angle), 0.0)
         pose = tfbus.Transform.from_axis_angle((0, 0, 1), angle + math.pi / 2, position)
-        odometry.send("map", "base_link", pose)
+        odometry.send("map", "robot1/base_link", pose)
 
 
 @contextlib.asynccontextmanager
-async def lifespan(_: Starlette) -> AsyncIterator[dict[str, tfbus.Buffer]]:
-    with tfbus.Bus() as bus, tfbus.Buffer(bus) as buffer:
+async def lifespan(app: fastapi.FastAPI) -> AsyncGenerator[None]:
+    with tfbus.Bus() as bus, tfbus.Buffer(bus) as app.state.buffer, tfbus.web.close_on_signal(app.state.buffer):
         calibration = tfbus.TransformBroadcaster(bus, authority="calibration")
-        calibration.send_static("base_link", "laser", tfbus.Transform((0.1, 0.0, 0.2)))
+        calibration.send_static("robot1/base_link", "robot1/laser", tfbus.Transform((0.1, 0.0, 0.2)))
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(drive, bus)
-            yield {"buffer": buffer}
+            yield
             tasks.cancel_scope.cancel()
 
 
-def buffer_of(connection: HTTPConnection) -> tfbus.Buffer:
-    buffer: tfbus.Buffer = connection.state.buffer
+async def buffer_of(connection: HTTPConnection) -> tfbus.Buffer:
+    buffer: tfbus.Buffer = connection.app.state.buffer
     return buffer
 
 
-async def page(_: Request) -> Response:
-    return HTMLResponse(PAGE)
+app = fastapi.FastAPI(lifespan=lifespan)
+app.add_middleware(TrustedHostMiddleware, allowed_hosts=HOSTS, www_redirect=False)
+OurBuffer = Annotated[tfbus.Buffer, fastapi.Depends(buffer_of)]
+Stamp = Annotated[int, fastapi.Query(ge=-(2**63), lt=2**63)]
+Timeout = Annotated[float, fastapi.Query(ge=0.0, le=LONGEST_WAIT)]
 
 
-async def tree(request: Request) -> Response:
-    return PlainTextResponse(buffer_of(request).describe())
+@app.exception_handler(tfbus.TransformError)
+async def no_answer(_: HTTPConnection, error: tfbus.TransformError) -> JSONResponse:
+    return JSONResponse(error.to_dict(), tfbus.web.status_of(error))
 
 
-async def transform(request: Request) -> Response:
-    target, source = request.path_params["target"], request.path_params["source"]
-    try:
-        at = int(request.query_params["at"]) if "at" in request.query_params else tfbus.LATEST
-        timeout = float(request.query_params.get("timeout", 1.0))
-        if timeout > LONGEST_WAIT:
-            raise ValueError(f"a timeout must be at most {LONGEST_WAIT:g} s, got {timeout!r} s")
-        found = await buffer_of(request).lookup(target, source, at, timeout=timeout)
-    except tfbus.LookupTimeoutError as error:
-        missing = error.__cause__
-        if isinstance(missing, tfbus.UnknownFrameError):
-            return JSONResponse({"error": str(missing), "close_matches": missing.close_matches}, 404)
-        return JSONResponse({"error": str(error)}, 504)
-    except (tfbus.TransformLookupError, ValueError) as error:
-        return JSONResponse({"error": str(error)}, 400)
-    except tfbus.BusClosedError as error:
-        return JSONResponse({"error": str(error)}, 503)
-    return JSONResponse(found.to_dict())
+@app.get("/", response_class=HTMLResponse)
+async def page() -> str:
+    return PAGE
 
 
-async def changes(request: Request) -> Response:
-    target, source = request.path_params["target"], request.path_params["source"]
+@app.get("/tree", response_class=PlainTextResponse)
+async def tree(buffer: OurBuffer) -> str:
+    return buffer.describe()
 
-    async def events() -> AsyncIterator[str]:
-        with buffer_of(request).watch(target, source, max_rate=10.0) as watch:
+
+@app.get("/transforms/{frame:path}")
+async def transform(
+    buffer: OurBuffer, frame: str, target: str = "map", at: Stamp | None = None, timeout: Timeout = 1.0
+) -> dict[str, Any]:
+    found = await buffer.lookup(target, frame, tfbus.LATEST if at is None else at, timeout=timeout)
+    return found.to_dict()
+
+
+@app.get("/changes/{frame:path}")
+async def changes(buffer: OurBuffer, frame: str, target: str = "map") -> StreamingResponse:
+    # A stream of an unknown frame would wait for it in silence.
+    await buffer.lookup(target, frame, timeout=1.0)
+
+    async def events() -> AsyncGenerator[str]:
+        with buffer.watch(target, frame, max_rate=10.0) as watch:
             async for found in watch:
                 yield f"data: {json.dumps(found.to_dict())}\n\n"
 
     return StreamingResponse(events(), media_type="text/event-stream")
 
 
-async def poses(socket: WebSocket) -> None:
-    target, source = socket.path_params["target"], socket.path_params["source"]
+@app.websocket("/poses/{frame:path}")
+async def poses(socket: fastapi.WebSocket, buffer: OurBuffer, frame: str, target: str = "map") -> None:
     # Programs other than browsers send no origin.
     origin = socket.headers.get("origin")
     if origin not in (None, f"http://{socket.headers.get('host')}", *ORIGINS):
         await socket.close()
         return
     await socket.accept()
-    # The service notices at the next message that a client has gone.
-    with contextlib.suppress(WebSocketDisconnect):
-        with buffer_of(socket).watch(target, source, max_rate=20.0) as watch:
-            async for found in watch:
-                await socket.send_json(found.to_dict())
-        await socket.close()
+    try:
+        await buffer.lookup(target, frame, timeout=1.0)
+    except tfbus.TransformError as error:
+        await socket.close(4000 + tfbus.web.status_of(error))
+        return
+    with buffer.watch(target, frame, max_rate=20.0) as watch:
 
+        async def notice_the_end() -> None:
+            while (await socket.receive())["type"] != "websocket.disconnect":
+                pass
+            watch.close()
 
-app = Starlette(
-    routes=[
-        Route("/", page),
-        Route("/tree", tree),
-        Route("/transforms/{target}/{source}", transform),
-        Route("/changes/{target}/{source}", changes),
-        WebSocketRoute("/poses/{target}/{source}", poses),
-    ],
-    middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS, www_redirect=False)],
-    lifespan=lifespan,
-)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(notice_the_end)
+            with contextlib.suppress(WebSocketDisconnect):
+                async for found in watch:
+                    await socket.send_json(found.to_dict())
+            tasks.cancel_scope.cancel()
+    # The client or the server may have closed it already.
+    with contextlib.suppress(RuntimeError, WebSocketDisconnect):
+        await socket.close(1012, "the service ends")
+
 
 if __name__ == "__main__":
     print("http://127.0.0.1:8000", flush=True)
-    # A stream has no end, so the server does not wait for it at its own end.
+    # A client that has stopped reading its stream does not hold up the end for longer than that.
     uvicorn.run(
-        app, host="127.0.0.1", port=8000, log_level="warning", limit_concurrency=100, timeout_graceful_shutdown=1
+        app, host="127.0.0.1", port=8000, log_level="warning", limit_concurrency=500, timeout_graceful_shutdown=3
     )

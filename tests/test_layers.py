@@ -51,7 +51,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "view": ("buffer", "recording", "robot"),
     "plot": ("recording",),
     "testing": ("geometry",),
-    "__init__": ("axes", "camera", "earth", "links", "message_filter", "recording", "synchronizer", "testing"),
+    "web": (),
+    "__init__": ("axes", "camera", "earth", "links", "message_filter", "recording", "synchronizer", "testing", "web"),
     "cli": ("__init__", "links", "plot", "view"),
     "__main__": ("cli",),
 }
@@ -86,7 +87,7 @@ EXTRAS = {
     "zenoh": ("links.rmw_zenoh", "links.zenoh"),
     "zstandard": ("recording.formats",),
 }
-NEVER_LOADED = {*EXTRAS, "hypothesis", "starlette", "uvicorn"}
+NEVER_LOADED = {*EXTRAS, "fastapi", "hypothesis", "starlette", "uvicorn"}
 
 
 def module_name(path: Path) -> str:

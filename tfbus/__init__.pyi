@@ -8,6 +8,7 @@ from tfbus import earth as earth
 from tfbus import recording as recording
 from tfbus import robot as robot
 from tfbus import testing as testing
+from tfbus import web as web
 from tfbus.analysis.examiner import Finding as Finding
 from tfbus.analysis.examiner import diagnose as diagnose
 from tfbus.buffer.buffer import Buffer as Buffer

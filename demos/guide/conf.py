@@ -68,6 +68,8 @@ nitpick_ignore_regex = [
     ("py:class", r"tfbus\.bus\.broadcaster\.Awaits"),
     # The policy of a question that waits, which a program reads from it and never makes.
     ("py:class", r"tfbus\.tree\.lookup\.Policy"),
+    # An object with a method `close`.
+    ("py:class", r"tfbus\.web\._Closable"),
     # The parts of a link, and the follower of a clock.
     ("py:class", r"tfbus\.links\.(endpoint\.(HearsTime|Endpoint)|seams\.Wire|lookups\.Serving)"),
     ("py:class", r"tfbus\._aio\.turn_budget\.TurnBudget"),
@@ -112,6 +114,7 @@ PATHS = (
     "tfbus.recording",
     "tfbus.analysis",
     "tfbus.testing",
+    "tfbus.web",
     "tfbus.data",
 )
 

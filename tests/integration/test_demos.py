@@ -1,6 +1,9 @@
 """The demos as a user runs them."""
 
+import asyncio
 import cmath
+import contextlib
+import gc
 import json
 import math
 import random
@@ -18,12 +21,15 @@ from urllib.parse import quote
 import anyio
 import httpx
 import pytest
+import uvicorn
 from support.processes import Program
 from support.samples import moving, static, tree_of
-from websockets.exceptions import InvalidStatus
+from websockets.asyncio.client import connect as connect_async
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
+import tfbus
 from tfbus import Bus, SimulatedClock
 from tfbus.cli.commands import tutorial
 from tfbus.testing import simulate
@@ -387,22 +393,32 @@ def test_the_demo_of_simulated_time_patrols_for_an_hour_and_jumps_back() -> None
     assert (on_the_base, on_the_map) == ("camera on the base: True", "camera on the map: False")
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[str]:
-    """The web application under a real server on loopback; its address."""
+@contextlib.contextmanager
+def web_application(*options: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """The web application under a real server on loopback: its address, and its process, which has its log."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         fd = str(listener.fileno())
-        command = [sys.executable, "-m", "uvicorn", "web_app:app", "--fd", fd, "--app-dir", str(DEMOS)]
+        command = [sys.executable, "-m", "uvicorn", "web_app:app", "--fd", fd, "--app-dir", str(DEMOS), *options]
         with subprocess.Popen(command, pass_fds=[listener.fileno()], stderr=subprocess.PIPE, text=True) as process:
             assert process.stderr is not None
             for line in process.stderr:
                 if "startup complete" in line:
                     break
-            yield f"127.0.0.1:{listener.getsockname()[1]}"
-            process.terminate()
-            log = process.communicate(timeout=30)[1]
-            assert "Traceback" not in log
-            assert "shutdown complete" in log
+            try:
+                yield f"127.0.0.1:{listener.getsockname()[1]}", process
+            finally:
+                process.terminate()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    """The address of the web application."""
+    with web_application() as (address, process):
+        yield address
+        process.terminate()
+        log = process.communicate(timeout=30)[1]
+        assert "Traceback" not in log
+        assert "shutdown complete" in log
 
 
 def get(path: str) -> httpx.Response:
@@ -415,7 +431,7 @@ def is_on_its_circle(answer: dict[str, Any]) -> bool:
 
 
 def test_the_web_application_answers_a_transform_as_json(server: str) -> None:
-    response = get(f"{server}/transforms/map/base_link")
+    response = get(f"{server}/transforms/robot1/base_link")
     assert response.status_code == 200
     answer = response.json()
     assert is_on_its_circle(answer)
@@ -427,12 +443,12 @@ def test_the_web_application_answers_a_transform_as_json(server: str) -> None:
 
 
 def test_the_web_application_streams_changes_as_events_and_to_a_socket(server: str) -> None:
-    with httpx.stream("GET", f"http://{server}/changes/map/base_link", timeout=30, trust_env=False) as response:
+    with httpx.stream("GET", f"http://{server}/changes/robot1/base_link", timeout=30, trust_env=False) as response:
         assert response.headers["content-type"].startswith("text/event-stream")
         lines = [line for line, _ in zip(response.iter_lines(), range(4), strict=False)]
     assert lines[1] == lines[3] == ""
     events = [json.loads(line.removeprefix("data: ")) for line in (lines[0], lines[2])]
-    with connect(f"ws://{server}/poses/map/base_link", proxy=None) as poses:
+    with connect(f"ws://{server}/poses/robot1/base_link", proxy=None) as poses:
         messages = [json.loads(poses.recv(timeout=30)) for _ in range(2)]
     for first, second in (events, messages):
         assert is_on_its_circle(first)
@@ -450,30 +466,119 @@ def test_the_web_application_has_a_page_and_shows_the_tree(server: str) -> None:
 
 
 def test_the_web_application_waits_for_a_transform_of_the_future_as_long_as_it_may(server: str) -> None:
-    now = get(f"{server}/transforms/map/base_link").json()["stamp"]
-    response = get(f"{server}/transforms/map/base_link?at={now + 200_000_000}&timeout=10")
+    now = get(f"{server}/transforms/robot1/base_link").json()["stamp"]
+    response = get(f"{server}/transforms/robot1/base_link?at={now + 200_000_000}&timeout=10")
     assert (response.status_code, response.json()["stamp"]) == (200, now + 200_000_000)
-    response = get(f"{server}/transforms/map/base_link?at={now + 3_600_000_000_000}&timeout=0.1")
+    response = get(f"{server}/transforms/robot1/base_link?at={now + 3_600_000_000_000}&timeout=0.1")
     assert response.status_code == 504
-    assert re.search(r"frame 'base_link': asked for .* short\), from 'odometry'", response.json()["error"])
+    assert re.search(r"frame 'robot1/base_link': asked for .* short\), from 'odometry'", response.json()["message"])
 
 
 def test_the_web_application_says_404_with_close_matches_for_an_unknown_frame(server: str) -> None:
-    response = get(f"{server}/transforms/map/base_lnk?timeout=0.1")
+    response = get(f"{server}/transforms/robot1/base_lnk?timeout=0.1")
     assert response.status_code == 404
-    assert response.json()["close_matches"] == ["base_link"]
+    assert response.json()["cause"]["close_matches"][0] == "robot1/base_link"
 
 
-@pytest.mark.parametrize("question", ["at=5", "timeout=nan", "at=99999999999999999999"])
-def test_the_web_application_says_400_for_a_question_without_an_answer(server: str, question: str) -> None:
-    assert get(f"{server}/transforms/map/base_link?{question}").status_code == 400
+@pytest.mark.parametrize(
+    ("question", "status"), [("at=5", 410), ("timeout=nan", 422), ("at=99999999999999999999", 422), ("at=1.5", 422)]
+)
+def test_the_web_application_names_the_fault_of_a_question_without_an_answer(
+    server: str, question: str, status: int
+) -> None:
+    assert get(f"{server}/transforms/robot1/base_link?{question}").status_code == status
 
 
 @pytest.mark.parametrize("question", ["timeout=1e308", "timeout=inf", "timeout=60.1", "timeout=1e400"])
 def test_the_web_application_holds_nothing_for_a_client_that_would_wait_for_ever(server: str, question: str) -> None:
-    response = get(f"{server}/transforms/map/nowhere?{question}")
-    assert response.status_code == 400
-    assert "at most 60 s" in response.json()["error"]
+    response = get(f"{server}/transforms/nowhere?{question}")
+    assert response.status_code == 422
+    assert "less than or equal to 60" in response.text
+
+
+def test_the_web_application_streams_no_frame_that_nobody_has_published(server: str) -> None:
+    assert get(f"{server}/changes/robot1/lazer").status_code == 404
+    with connect(f"ws://{server}/poses/robot1/lazer", proxy=None) as poses:
+        with pytest.raises(ConnectionClosed):
+            poses.recv(timeout=30)
+        assert poses.close_code == 4404
+
+
+def test_nothing_stays_in_the_web_application_of_clients_that_have_left() -> None:
+    async def leave(address: str, politely: bool) -> None:
+        # A static transform changes once: after that, the service has nothing more to send.
+        question = "robot1/laser?target=robot1/base_link"
+        async with connect_async(f"ws://{address}/poses/{question}", proxy=None) as poses:
+            await poses.recv()
+            if not politely:
+                poses.transport.abort()
+
+    async def main() -> None:
+        with socket.create_server(("127.0.0.1", 0)) as listener, anyio.fail_after(60):
+            config = uvicorn.Config(load("web_app.py")["app"], log_level="error")
+            service = uvicorn.Server(config)
+            serving = asyncio.create_task(service.serve([listener]))
+            while not service.started:  # noqa: ASYNC110 - uvicorn has no event
+                await asyncio.sleep(0.01)
+            before = len(asyncio.all_tasks())
+            address = f"127.0.0.1:{listener.getsockname()[1]}"
+            await asyncio.gather(*(leave(address, number % 2 == 0) for number in range(200)))
+            while len(asyncio.all_tasks()) > before:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+            gc.collect()
+            assert not [thing for thing in gc.get_objects() if isinstance(thing, tfbus.Watch)]
+            service.should_exit = True
+            await serving
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("loop", ["asyncio", "uvloop"])
+def test_at_a_signal_the_web_application_ends_its_streams_and_waits(loop: str) -> None:
+    pytest.importorskip(loop)
+
+    async def main(address: str, process: subprocess.Popen[str]) -> None:
+        begun = [asyncio.Event() for _ in range(40)]
+
+        async def read_events(client: httpx.AsyncClient, begin: asyncio.Event) -> None:
+            async with client.stream("GET", "/changes/robot1/laser") as response:
+                # A stream that is cut off raises.
+                async for _ in response.aiter_lines():
+                    begin.set()
+
+        async def read_poses(target: str, begin: asyncio.Event) -> None:
+            async with connect_async(f"ws://{address}/poses/robot1/laser?target={target}", proxy=None) as poses:
+                with contextlib.suppress(ConnectionClosed):
+                    while await poses.recv():
+                        begin.set()
+            assert poses.close_code == 1012
+
+        async def ask(client: httpx.AsyncClient) -> None:
+            assert (await client.get("/transforms/nowhere?timeout=60")).status_code == 503
+
+        limits = httpx.Limits(max_connections=None)
+        async with (
+            httpx.AsyncClient(base_url=f"http://{address}", timeout=60, trust_env=False, limits=limits) as client,
+            asyncio.timeout(60),
+            asyncio.TaskGroup() as tasks,
+        ):
+            for _ in range(20):
+                tasks.create_task(ask(client))
+            for begin in begun[:20]:
+                tasks.create_task(read_events(client, begin))
+            for begin, target in zip(begun[20:], 10 * ["map", "robot1/base_link"], strict=True):
+                tasks.create_task(read_poses(target, begin))
+            for begin in begun:
+                await begin.wait()
+            # The questions came first, so all of them wait by now.
+            process.terminate()
+        log = process.communicate(timeout=30)[1]
+        assert "shutdown complete" in log
+        assert "Traceback" not in log
+        assert "ERROR" not in log
+
+    with web_application("--loop", loop) as (address, process):
+        asyncio.run(main(address, process))
 
 
 def test_the_web_application_sends_nothing_to_pages_of_other_sites(server: str) -> None:
@@ -481,21 +586,21 @@ def test_the_web_application_sends_nothing_to_pages_of_other_sites(server: str) 
     for origin in ("http://evil.example", "null", f"http://127.0.0.1:{int(port) + 1}", f"https://{server}"):
         with (
             pytest.raises(InvalidStatus, match="403"),
-            connect(f"ws://{server}/poses/map/base_link", origin=Origin(origin), proxy=None),
+            connect(f"ws://{server}/poses/robot1/base_link", origin=Origin(origin), proxy=None),
         ):
             pytest.fail("connected")
-    with connect(f"ws://{server}/poses/map/base_link", origin=Origin(f"http://{server}"), proxy=None) as poses:
+    with connect(f"ws://{server}/poses/robot1/base_link", origin=Origin(f"http://{server}"), proxy=None) as poses:
         assert is_on_its_circle(json.loads(poses.recv(timeout=30)))
 
 
 def test_the_web_application_does_not_answer_to_other_names(server: str) -> None:
-    for path in ("", "/tree", "/transforms/map/base_link", "/changes/map/base_link"):
+    for path in ("", "/tree", "/transforms/robot1/base_link", "/changes/robot1/base_link"):
         response = httpx.get(f"http://{server}{path}", headers={"Host": "evil.example"}, timeout=30, trust_env=False)
         assert response.status_code == 400
     evil = {"Host": "evil.example"}
     with (
         pytest.raises(InvalidStatus, match="400"),
-        connect(f"ws://{server}/poses/map/base_link", additional_headers=evil, proxy=None),
+        connect(f"ws://{server}/poses/robot1/base_link", additional_headers=evil, proxy=None),
     ):
         pytest.fail("connected")
 
@@ -503,7 +608,7 @@ def test_the_web_application_does_not_answer_to_other_names(server: str) -> None
 @pytest.mark.thorough
 def test_the_web_application_has_a_defined_answer_for_every_question(server: str) -> None:
     draw = random.Random(34)
-    names = ["map", "base_link", " ", "%", "+", "🤖", "1_0", "'", "..", "x" * 500]
+    names = ["map", "robot1/base_link", " ", "%", "+", "🤖", "1_0", "'", "..", "x" * 500]
     pieces = ["9" * 401, "-", "1e308", "nan", "٣", "\0", *names]
 
     def text() -> str:
@@ -511,10 +616,10 @@ def test_the_web_application_has_a_defined_answer_for_every_question(server: str
 
     with httpx.Client(base_url=f"http://{server}", timeout=30, trust_env=False) as client:
         for _ in range(300):
-            frames = [draw.choice(["map", "base_link", text()]) for _ in range(2)]
+            target, frame = (draw.choice(["map", quote("robot1/base_link"), text()]) for _ in range(2))
             questions = [f"{draw.choice(['at', 'timeout', text()])}={text()}" for _ in range(draw.randrange(3))]
-            response = client.get(f"/transforms/{'/'.join(frames)}?{'&'.join([*questions, 'timeout=0'])}")
-            assert response.status_code in (200, 400, 404, 504)
+            response = client.get(f"/transforms/{frame}?{'&'.join([*questions, f'target={target}', 'timeout=0'])}")
+            assert response.status_code in (200, 404, 410, 422, 504)
 
 
 @pytest.mark.thorough

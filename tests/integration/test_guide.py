@@ -44,6 +44,7 @@ PUBLIC = [
     "tfbus.robot",
     "tfbus.testing",
     "tfbus.view",
+    "tfbus.web",
 ]
 CONSOLE = re.compile(r"^```console\n([\s\S]*?)^```|((?:^    \S.*\n)+)", re.MULTILINE)
 

@@ -14,7 +14,7 @@ EXTRAS = {
     "rosbridge": ("cbor2", "wsproto"),
     "urdf": ("urdf_parser_py",),
     "view": ("collada", "trimesh", "viser"),
-    "web": ("starlette", "uvicorn", "websockets"),
+    "web": ("fastapi", "uvicorn", "websockets"),
     "zenoh": ("zenoh",),
     "trio": ("trio",),
     "test": ("httpx", "uvloop"),

@@ -2,6 +2,7 @@ import math
 import random
 import socket
 import threading
+from contextlib import suppress
 from typing import Any, Self
 
 import httpx
@@ -60,6 +61,22 @@ def test_a_head_that_comes_in_pieces_is_judged_and_one_without_an_end_is_refused
         with socket.create_connection(("127.0.0.1", server.get_port())) as client:
             client.sendall(b"x" * 20_000)
             assert client.recv(1_000).split()[1] == b"400"
+
+
+def test_a_check_of_the_port_leaves_no_traceback(caplog: pytest.LogCaptureFixture) -> None:
+    # The first connections to a server of their own: viser mends the log itself when it answers its first request.
+    upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\n"
+    key = "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+    with viser_page() as server:
+        for first in ("", "\r\n\r\n", "HEAD / HTTP/1.1\r\n", f"GET / HTTP/1.1\r\n{upgrade}{key}"):
+            for patient in (False, True):
+                with socket.create_connection(("127.0.0.1", server.get_port())) as client:
+                    client.sendall(first.encode() and f"{first}Host: localhost\r\n\r\n".encode())
+                    if patient and first:
+                        with suppress(ConnectionResetError):
+                            client.recv(1)
+        assert httpx.get(f"http://127.0.0.1:{server.get_port()}", trust_env=False).status_code == 200
+    assert [record for record in caplog.records if record.levelname == "ERROR"] == []
 
 
 def test_connections_have_a_bound_and_those_that_say_nothing_count(caplog: pytest.LogCaptureFixture) -> None:

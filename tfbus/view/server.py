@@ -34,6 +34,9 @@ MAX_CONNECTIONS = 100
 _MOST = 1e12
 _NEAR = 1e-6
 _console_lock = threading.Lock()
+_connection_log = logging.getLogger("tfbus.view.connections")
+# A port check, or a browser that leaves early, ends before its handshake does; websockets would log a traceback.
+_connection_log.addFilter(lambda record: record.msg != "opening handshake failed")
 
 _Number = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
 _Size = Annotated[int, msgspec.Meta(ge=0, le=1_000_000)]
@@ -157,6 +160,7 @@ class _AtTheDoor(asyncio.Protocol):
             return
         served = self._make()
         served.protocol.max_message_size = MAX_MESSAGE
+        served.logger = logging.LoggerAdapter(_connection_log)
         # viser would raise an error for text messages, so they are passed on as bytes.
         served.recv = partial(served.recv, decode=False)
         lost = served.connection_lost
