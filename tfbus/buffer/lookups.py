@@ -410,8 +410,9 @@ class Lookups:
 
     def complete(self, error: TransformLookupError, max_age: float | None, bounds: Bounds | None) -> None:
         """Write into an error of the tree what only the bus and its clock know."""
-        if isinstance(error, UnknownFrameError):
-            error.missed = self.share.end_reason is None and self.bus._knows(error.frame)
+        if type(error) is UnknownFrameError:
+            error.missed = self.share.end_reason is None and error.frame in self.bus._topology.names.frames
+            return
         if not isinstance(error, ExtrapolationError):
             return
         if max_age is not None and bounds is not None and error.newest is not None and error.stamp in bounds:
