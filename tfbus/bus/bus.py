@@ -423,7 +423,7 @@ class Bus:
         stream = Stream(capacity, overflow, self._check_thread, self._detach_stream)
         latched = tuple(self._topology.latched.samples.values())
         if latched:
-            stream.put(latched)
+            stream.queue.put(latched)
         self._streams.append(stream)
         return stream
 
@@ -700,7 +700,8 @@ class Bus:
 
     def _put_into_streams(self, batch: Batch) -> None:
         for stream in self._streams:
-            stream.put(batch)
+            stream.queue.put(batch)
+            stream.wake()
 
     def _note_in_events(self, batch: Batch) -> None:
         for events in self._events:
