@@ -505,21 +505,18 @@ class Lookups:
         finally:
             self.end(wait)
 
-    def begin(self, wait: Wait) -> Generator[Any, None, None] | None:
-        """The sleep of a lookup that the kernel is about to park; None if it must not. Called by the kernel.
+    def begin(self, wait: Wait) -> bool:
+        """Whether the kernel may park a lookup on the event loop that runs now. Called by the kernel.
 
-        On the loop that runs now, the kernel then does the same without this method.
+        The kernel does not ask again on that loop.
         """
         loop = running_loop()
-        if self.share.end_reason is not None or wait.patience == 0.0:
-            return None
-        if self._looking_on is not loop and not self._is_here():
-            return None
-        wait.share, wait.since = self.share, self.now()
-        sleep, wait.wake = wake_up(loop)
-        self._set_alarms(wait, loop)
+        is_here = self._looking_on is loop or self._is_here()
+        if not is_here or self.share.end_reason is not None or wait.patience == 0.0:
+            return False
+        self._look_on(loop, REPORT_AFTER)
         self.feed.loop, self.feed.call_after = loop, self._alarms.on(loop)
-        return sleep
+        return True
 
     def given(self, wait: Wait) -> TransformStamped | None:
         """The answer that came with the wake-up, if nothing has changed since."""
@@ -561,7 +558,12 @@ class Lookups:
                 self.share.park(wait, error)
             elif not self.feed.park(wait):
                 return False
-            self._set_alarms(wait, running_loop())
+            loop = running_loop()
+            self._look_on(loop, REPORT_AFTER - to_seconds(self.now() - wait.since))
+            if wait.patience == 0.0:
+                wait.expired = True
+            elif wait.patience < math.inf and wait.cancel_end is None:
+                wait.cancel_end = self._alarms.on(loop)(wait.patience, wait.expire)
         except BaseException:
             self.end(wait)
             raise
@@ -626,14 +628,10 @@ class Lookups:
         missing = cast(TransformLookupError, wait.blocked_by)
         raise LookupTimeoutError(target=target, source=source, timeout=wait.patience, missing=missing) from missing
 
-    def _set_alarms(self, wait: Wait, loop: Any) -> None:
-        """Set the alarm for the end of a wait, if it has an end and no alarm, and that for all that hang."""
-        if wait.patience == 0.0:
-            wait.expired = True
-        elif wait.patience < math.inf and wait.cancel_end is None:
-            wait.cancel_end = self._alarms.on(loop)(wait.patience, wait.expire)
+    def _look_on(self, loop: Any, pause: float) -> None:
+        """Look at the lookups that hang after some time (s), unless a look on this loop is due."""
         if self._looking_on is not loop:
-            self._look_after(max(REPORT_AFTER - to_seconds(self.now() - wait.since), 0.0))
+            self._look_after(max(pause, 0.0))
 
     def _look_after(self, pause: float) -> None:
         """Look at the lookups that hang after some time (s), unless that is infinite."""
