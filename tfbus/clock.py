@@ -76,8 +76,8 @@ class Clock(Protocol):
     """The protocol of clocks: now, sleeping, ticks, timeouts and jumps.
 
     On a `SystemClock`, a buffer sets one timer of the event loop for all its waiting lookups; on a `SimulatedClock`, it
-    uses the method ``call_after``. On any other clock, also of a class derived from these two, each wait uses
-    `move_on_after`.
+    uses the method ``call_after``. On any other clock, also of a class derived from these two, a task in a
+    `move_on_after` of its own ends each wait.
 
     A clock without a time at first may have a property ``is_set``. Until it is true, a bus compares no stamp with it.
     """

@@ -5,8 +5,8 @@ transform-tree and tfbus give the same transforms, one as matrices, the other as
 """
 
 from collections.abc import Callable
-from itertools import pairwise
-from time import perf_counter
+from itertools import count, pairwise
+from time import perf_counter, thread_time
 from typing import Any, NamedTuple
 
 import cases
@@ -89,23 +89,88 @@ def test_one_lookup_by_name(table: Table, chain: str) -> None:
     table.measure(f"lookup by name, {edges(chain)}", on, "transform-tree", with_each(peer.lookup), "<= 0.6", "ns")
 
 
-@pytest.mark.parametrize("chain", ["m" * 10, "m" * 30], ids=edges)
-def test_the_latest_of_edges_with_equal_stamps(table: Table, chain: str) -> None:
-    """The plan of transform-tree takes the newest sample of each edge, so here both give the same answer."""
-    stamps = START + PERIOD * np.arange(1_000)
-    series = [each._replace(stamps=stamps) for each in series_of(chain)]
-    plan, source = transform_tree_of(series).plan(BASE, last_of(chain)), last_of(chain)
+DEEP = pytest.mark.parametrize("chain", ["m" * 10, "m" * 30], ids=edges)
+TREES = 50
+"""So many trees get a new sample, and then each is asked once; so nothing is known from the question before."""
+
+
+@DEEP
+def test_one_lookup_by_a_plan(table: Table, chain: str) -> None:
+    """No stamp comes twice, and the peer has its path and needs no names."""
+    series, source = series_of(chain), last_of(chain)
+    plan = transform_tree_of(series).plan(BASE, source)
+    stamps = [*dict.fromkeys(cases.questions("lookup"))]
 
     def on(package: Any) -> Turn:
-        tree = package.TransformTree(2 * cases.KEEP)
-        for parent, child, own, translations, wxyz in series:
-            tree.insert_columns(parent, child, own, translations, np.roll(wxyz, -1, axis=1))
-        found = tree.lookup(BASE, source).transform.matrix()
-        np.testing.assert_allclose(found, plan.latest(), rtol=0, atol=1e-12)
-        return timed(lambda: [tree.lookup(BASE, source) for _ in range(MANY)], MANY)
+        tree = tree_of(chain, package)
+        found = tree.lookup(BASE, source, stamps[0]).transform.matrix()
+        np.testing.assert_allclose(found, plan.at(stamps[0]), rtol=0, atol=1e-12)
+        return timed(lambda: [tree.lookup(BASE, source, stamp) for stamp in stamps], len(stamps))
 
-    peer = timed(lambda: [plan.latest() for _ in range(MANY)], MANY)
-    table.measure(f"lookup LATEST, equal stamps, {edges(chain)}", on, "transform-tree", peer, "<= 1.0", "ns")
+    peer = timed(lambda: [plan.at(stamp) for stamp in stamps], len(stamps))
+    table.measure(f"lookup at a stamp, {edges(chain)}", on, "plan of transform-tree", peer, "<= 1.0", "ns")
+
+
+@DEEP
+@pytest.mark.parametrize("equal", [True, False], ids=["equal stamps", "own stamps"])
+def test_the_latest_after_each_new_sample(table: Table, chain: str, equal: bool) -> None:
+    """With equal stamps, `latest` of a plan gives our answer. With stamps of their own, the plan is told the stamp."""
+    series, source = series_of(chain), last_of(chain)
+    if equal:
+        series = [each._replace(stamps=START + PERIOD * np.arange(1_000)) for each in series]
+    common = np.min([each.stamps for each in series], axis=0)
+
+    def asked_once(asks: list[Callable[[int], Any]], insert: Callable[[int], None]) -> Turn:
+        steps = count()
+        insert(next(steps))
+
+        def one_turn() -> float:
+            insert(step := next(steps))
+            stamp = int(common[step])
+            start = thread_time()
+            for ask in asks:
+                ask(stamp)
+            return (thread_time() - start) / len(asks)
+
+        # The first answer of each tree finds the path.
+        one_turn()
+        return one_turn
+
+    def on(package: Any) -> Turn:
+        trees = [package.TransformTree() for _ in range(TREES)]
+
+        def insert(step: int) -> None:
+            for tree in trees:
+                for parent, child, stamps, translations, wxyz in series:
+                    rotation = np.roll(wxyz[step], -1)
+                    tree.insert_columns(parent, child, stamps[[step]], translations[[step]], rotation[None])
+
+        def ask_of(tree: Any) -> Callable[[int], Any]:
+            return lambda _: tree.lookup(BASE, source)
+
+        ours = asked_once(list(map(ask_of, trees)), insert)
+        found = trees[0].lookup(BASE, source)
+        assert found.stamp == common[1]
+        np.testing.assert_allclose(found.transform.matrix(), plans[0].at(int(common[1])), rtol=0, atol=1e-12)
+        return ours
+
+    tf_tree = pytest.importorskip("tf_tree")
+    names = [(each.parent, each.child) for each in series]
+    peers = [tf_tree.build(names, capacity=64, interp="lerpslerp") for _ in range(TREES)]
+    publishers = [[peer.publisher(child, parent) for parent, child in names] for peer in peers]
+    plans = [peer.plan(BASE, source) for peer in peers]
+
+    def insert_into_peers(step: int) -> None:
+        for their in publishers:
+            for publisher, each in zip(their, series, strict=True):
+                publisher.push(int(each.stamps[step]), [*each.wxyz[step], *each.translations[step]])
+
+    def plan_of(plan: Any) -> Callable[[int], Any]:
+        return (lambda _: plan.latest()) if equal else plan.at
+
+    peer = asked_once(list(map(plan_of, plans)), insert_into_peers)
+    label = f"LATEST, new {'equal' if equal else 'own'} stamps, {edges(chain)}"
+    table.measure(label, on, "plan of transform-tree", peer, "<= 1.0", "ns")
 
 
 @pytest.mark.parametrize("order", ["sorted", "random"])

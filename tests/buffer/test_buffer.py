@@ -148,11 +148,12 @@ async def test_a_sample_in_the_turn_in_which_the_timeout_expires_still_answers(
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5, timeout=timeout))
         await settle()
         if phase == "after the report" and timeout != 2.0:
-            clock.scopes[-1].cancel()
+            clock.scopes[0].cancel()
             await settle()
             assert len(buffer.pending()) == 1
-        # The first scope is that of the timeout, and the last one that of the report.
-        scope = clock.scopes[0 if phase == "at the timeout" else -1]
+        # The first scope is that of the report, and the next one that of the timeout; a report leads to another.
+        place = {"before the report": 0, "after the report": -1, "at the timeout": 0 if timeout is None else 1}[phase]
+        scope = clock.scopes[place]
         steps: list[Callable[[], object]] = [scope.cancel, lambda: bus.publish(moving("map", "a", 9))]
         for step in reversed(steps) if data_first else steps:
             step()

@@ -251,7 +251,7 @@ async def test_a_transform_in_the_turn_in_which_the_timeout_expires_delivers_the
     put(streams, Scan(5))
     async with MessageFilter(streams.receive, buffer, "map", timeout=1.0) as pairs:
         await settle()
-        clock.scopes[0].cancel()
+        clock.scopes[-1].cancel()
         bus.publish(moving("map", "laser", 5))
         assert (await anext(pairs))[0] == Scan(5)
         assert dict(pairs.dropped) == {}

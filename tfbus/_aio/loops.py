@@ -11,7 +11,7 @@ import logging
 import sys
 import threading
 from asyncio import get_running_loop
-from collections.abc import Awaitable, Callable, Generator, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import Context, copy_context
 from functools import partial
@@ -45,6 +45,20 @@ def running_loop() -> Any:
 
 def _lowlevel() -> Any:
     return sys.modules["trio.lowlevel"]
+
+
+_spawned: set[Any] = set()
+
+
+def spawn(loop: Any, function: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Start a task of no task group on the running loop; it must not raise."""
+    if here.name is not None:
+        _lowlevel().spawn_system_task(function)
+        return
+    # asyncio holds its tasks weakly.
+    task = loop.create_task(function())
+    _spawned.add(task)
+    task.add_done_callback(_spawned.discard)
 
 
 @coroutine

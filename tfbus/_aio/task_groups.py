@@ -67,15 +67,13 @@ class OneReaderStream(ABC, Generic[ItemT]):
         self._detach = detach
         self._reader = OneReader()
         self._ended = False
+        self.wake: Callable[[], None] = self._reader.wake
+        """Makes a waiting reader look for the next item again."""
 
     @property
     def waiting(self) -> bool:
         """Whether a reader waits for an item."""
         return self._reader.waiting
-
-    def wake(self) -> None:
-        """Make a waiting reader look for the next item again."""
-        self._reader.wake()
 
     def end(self) -> None:
         """Let the reader read all pending items, then end the iteration."""

@@ -11,9 +11,8 @@
  * that awaits the Parked goes on. An exception (a cancellation) is thrown into that coroutine, and it takes the Parked out
  * of the index: there is no `throw` here.
  *
- * The event loop is Python's: `begin` makes the wake-up, notes the time, sets the alarms, and gives the iterator that
- * sleeps. After it has checked the thread and set the alarm for all lookups that hang, it names the `loop`; there, a sleep
- * is a future of asyncio or a task of trio, and takes no more of Python than they do.
+ * The event loop is Python's: `begin` checks the thread, sets the alarm for all lookups that hang, and names the `loop`.
+ * There, a sleep is a future of asyncio or a task of trio, and takes no more of Python than they do.
  *
  * `insert` stores a batch, pops from the lines of its frames whoever is due, and calls `wake` with the answer already
  * found, if that is plain. It takes a batch only if the lines need nothing else: nobody waits for any sample, no limit is
@@ -634,29 +633,42 @@ bare_sleep(Parked *waiter, PyObject *loop)
     return sleep;
 }
 
+/* Whether lookups may sleep on the event loop that runs now; -1 for an error. */
+static int
+feed_may_sleep(const Feed *self, Parked *waiter)
+{
+    if (self->parts[LOOP] != NULL && waiter->patience > 0.0) {
+        PyObject *hook = hook_of_loop();
+        const int known = hook != NULL && hook == self->parts[HOOK];
+        Py_XDECREF(hook);
+        if (known || hook == NULL) {
+            return known ? 1 : -1;
+        }
+    }
+    PyObject *begun = PyObject_CallFunctionObjArgs(self->parts[BEGIN], OBJECT(waiter), NULL);
+    const int may = begun == NULL ? -1 : begun == Py_True && self->parts[LOOP] != NULL;
+    Py_XDECREF(begun);
+    return may;
+}
+
 /* The iterator that sleeps until a waiter is woken; None to let Python go on. */
 static PyObject *
 feed_sleeper(const Feed *self, Parked *waiter)
 {
-    PyObject *loop = self->parts[LOOP], *hook = NULL, *sleeper;
     int64_t now;
-    if (loop != NULL && waiter->patience > 0.0 && (hook = hook_of_loop()) == NULL) {
+    const int may = feed_may_sleep(self, waiter);
+    if (may <= 0 || !paths_now((const Paths *)self->parts[PATHS], &now)) {
+        return may < 0 || PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
+    }
+    PyObject *loop = Py_NewRef(self->parts[LOOP]), *sleeper = bare_sleep(waiter, loop), *old = waiter->share;
+    Py_DECREF(loop);
+    if (sleeper == NULL) {
         return NULL;
     }
-    const int known = hook != NULL && hook == self->parts[HOOK] && paths_now((const Paths *)self->parts[PATHS], &now);
-    Py_XDECREF(hook);
-    if (!known) {
-        return PyErr_Occurred() ? NULL : PyObject_CallFunctionObjArgs(self->parts[BEGIN], OBJECT(waiter), NULL);
-    }
-    Py_INCREF(loop);
-    if ((sleeper = bare_sleep(waiter, loop)) != NULL) {
-        PyObject *old = waiter->share;
-        waiter->share = self->parts[SHARE] == NULL ? NULL : Py_NewRef(self->parts[SHARE]);
-        waiter->since = now;
-        Py_XDECREF(old);
-    }
-    Py_DECREF(loop);
-    if (sleeper != NULL && waiter->patience < Py_HUGE_VAL && waiter->cancel_end == NULL) {
+    waiter->share = Py_XNewRef(self->parts[SHARE]);
+    waiter->since = now;
+    Py_XDECREF(old);
+    if (waiter->patience < Py_HUGE_VAL && waiter->cancel_end == NULL) {
         PyObject *seconds = PyFloat_FromDouble(waiter->patience), *expire = PyObject_GetAttr(OBJECT(waiter), expire_string);
         if (seconds != NULL && expire != NULL && self->parts[CALL_AFTER] != NULL) {
             waiter->cancel_end = PyObject_CallFunctionObjArgs(self->parts[CALL_AFTER], seconds, expire, NULL);
@@ -1052,7 +1064,7 @@ static PyGetSetDef feed_getset[] = {
 
 static PyMemberDef feed_members[] = {
     {"begin", T_OBJECT, offsetof(Feed, parts[BEGIN]), 0,
-     PyDoc_STR("begin(waiter): the iterator that sleeps until `wake` of the waiter is called; None to let Python go on.")},
+     PyDoc_STR("begin(waiter): set `loop` to the event loop that runs; whether a lookup may sleep on it.")},
     {"call_after", T_OBJECT, offsetof(Feed, parts[CALL_AFTER]), 0,
      PyDoc_STR("call_after(seconds, callback): set an alarm on that loop, and return what cancels it.")},
     {"here", T_OBJECT, offsetof(Feed, parts[HERE]), 0,

@@ -128,7 +128,7 @@ class Buffer:
         self._forest = self._lookups.forest = forest
         self._paths = forest.paths if self._local_names is None else forest.local_paths()
         self._paths.now = self._lookups.now
-        plain = self._local_names is None and self._lookups.has_alarms and forest is self._share.live.forest
+        plain = self._local_names is None and forest is self._share.live.forest
         self._feed = self._lookups.feed if plain else None
 
     @property

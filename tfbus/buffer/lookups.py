@@ -8,7 +8,7 @@ otherwise it asks again, and may park again on the same deadline.
 The kernel does all this for a plain lookup that lacks nothing but newer samples, and parks it at once: the sleep is its
 checkpoint. It calls `Lookups.begin` for the first sleep on an event loop, makes the later ones itself, and gives None
 where something is not plain. `Lookups.go_on` is the whole wait in Python. It goes on from there, and it is the only way
-without the compiled kernel, with a prefix, with options, and on a clock that is not a class of tfbus.
+without the compiled kernel, with a prefix, and with options.
 
 An alarm ends a wait at its timeout. A cancel scope for each wait would set and remove a timer of the event loop each
 time; the alarms of a buffer share one timer. The timer is set for the first alarm. When that alarm is cancelled, the
@@ -20,14 +20,17 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Generator, Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
+from functools import partial
 from heapq import heapify, heappop, heappush
 from itertools import count
 from time import time_ns
 from typing import Any, Protocol, cast
 
-from tfbus._aio.loops import asleep, checkpoint, here, running_loop, wake_up
+import anyio
+
+from tfbus._aio.loops import asleep, checkpoint, here, running_loop, spawn, wake_up
 from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import SeenKeys
 from tfbus.clock import Clock, SimulatedClock, SystemClock
@@ -87,21 +90,26 @@ class LoopTimer:
             self._handle.deadline = due
         else:
             self._handle = self._trio.CancelScope(deadline=due)
-            self._trio.lowlevel.spawn_system_task(self._sleep, self._handle)
+            spawn(self.loop, partial(self._sleep, self._handle))
 
     def _fire(self) -> None:
         self._handle = None
         self.due = math.inf
-        try:
-            self._callback()
-        except Exception:
-            # No task would receive the error, and it would end the whole run of trio.
-            logging.getLogger("tfbus").exception("a timer raised")
+        call_back(self._callback)
 
     async def _sleep(self, scope: Any) -> None:
         with scope:
             await cast(Any, self._trio).sleep_forever()
         self._fire()
+
+
+def call_back(callback: Callable[[], object]) -> None:
+    """Call a function, and log its `Exception`."""
+    try:
+        callback()
+    except Exception:
+        # No task would receive the error, and it would end the whole run of trio.
+        logging.getLogger("tfbus").exception("a timer raised")
 
 
 class LocalNames:
@@ -179,12 +187,37 @@ class Alarms(Protocol):
         """The alarms on the running event loop, as `running_loop` gives it."""
 
 
-def alarms_of(clock: Clock) -> Alarms | None:
-    """Alarms by the clock of a bus; None for a clock that is not a class of tfbus."""
+def alarms_of(clock: Clock) -> Alarms:
+    """Alarms by the clock of a bus."""
     # Not isinstance: a class derived from a clock may tell the time in another way.
     if type(clock) is SystemClock:
         return LoopAlarms()
-    return SimulatedAlarms(clock) if type(clock) is SimulatedClock else None
+    return SimulatedAlarms(clock) if type(clock) is SimulatedClock else ClockAlarms(clock)
+
+
+class ClockAlarms:
+    """Alarms by a clock that is not a class of tfbus: each is a task in a scope of that clock."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+
+    def on(self, loop: Any) -> CallAfter:
+        """The alarms on the running event loop, as `running_loop` gives it."""
+
+        def call_after(seconds: float, callback: Callable[[], object]) -> Cancel:
+            alarm = anyio.CancelScope()
+            spawn(loop, partial(self._ring, alarm, self._clock.move_on_after(seconds), callback))
+            return alarm.cancel
+
+        return call_after
+
+    async def _ring(
+        self, alarm: anyio.CancelScope, time: AbstractContextManager[anyio.CancelScope], callback: Callable[[], object]
+    ) -> None:
+        with alarm:
+            with time:
+                await anyio.sleep_forever()
+            call_back(callback)
 
 
 class SimulatedAlarms:
@@ -394,11 +427,6 @@ class Lookups:
         if self.feed is not None:
             self.feed.kind, self.feed.here, self.feed.begin = Wait, here, self.begin
 
-    @property
-    def has_alarms(self) -> bool:
-        """Whether a wait needs no cancel scopes."""
-        return self._alarms is not None
-
     def bounds(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> Bounds | None:
         """The stamps that count as `LATEST` now; None for any."""
         if at is not LATEST and source_at is not LATEST:
@@ -410,8 +438,9 @@ class Lookups:
 
     def complete(self, error: TransformLookupError, max_age: float | None, bounds: Bounds | None) -> None:
         """Write into an error of the tree what only the bus and its clock know."""
-        if isinstance(error, UnknownFrameError):
-            error.missed = self.share.end_reason is None and self.bus._knows(error.frame)
+        if type(error) is UnknownFrameError:
+            error.missed = self.share.end_reason is None and error.frame in self.bus._topology.names.frames
+            return
         if not isinstance(error, ExtrapolationError):
             return
         if max_age is not None and bounds is not None and error.newest is not None and error.stamp in bounds:
@@ -459,8 +488,6 @@ class Lookups:
 
         Every jump back of the clock after `last_reset` ends it.
         """
-        if self._alarms is None:
-            return await self._wait_in_scopes(wait, last_reset)
         waiting = self.share.live.waiting
         try:
             while True:
@@ -478,23 +505,18 @@ class Lookups:
         finally:
             self.end(wait)
 
-    def begin(self, wait: Wait) -> Generator[Any, None, None] | None:
-        """The sleep of a lookup that the kernel is about to park; None if it must not. Called by the kernel.
+    def begin(self, wait: Wait) -> bool:
+        """Whether the kernel may park a lookup on the event loop that runs now. Called by the kernel.
 
-        On the loop that runs now, the kernel then does the same without this method.
+        The kernel does not ask again on that loop.
         """
-        if self.share.end_reason is not None or wait.patience == 0.0 or self._alarms is None:
-            return None
         loop = running_loop()
-        if self._looking_on is not loop:
-            if not self._is_here():
-                return None
-            self._look_after(REPORT_AFTER)
-        wait.share, wait.since = self.share, self.now()
-        sleep, wait.wake = wake_up(loop)
-        self._set_end(wait, loop)
+        is_here = self._looking_on is loop or self._is_here()
+        if not is_here or self.share.end_reason is not None or wait.patience == 0.0:
+            return False
+        self._look_on(loop, REPORT_AFTER)
         self.feed.loop, self.feed.call_after = loop, self._alarms.on(loop)
-        return sleep
+        return True
 
     def given(self, wait: Wait) -> TransformStamped | None:
         """The answer that came with the wake-up, if nothing has changed since."""
@@ -536,14 +558,12 @@ class Lookups:
                 self.share.park(wait, error)
             elif not self.feed.park(wait):
                 return False
-            if self._alarms is not None:
-                loop = running_loop()
-                if self._looking_on is not loop:
-                    self._look_after(max(REPORT_AFTER - to_seconds(self.now() - wait.since), 0.0))
-                if wait.patience == 0.0:
-                    wait.expired = True
-                else:
-                    self._set_end(wait, loop)
+            loop = running_loop()
+            self._look_on(loop, REPORT_AFTER - to_seconds(self.now() - wait.since))
+            if wait.patience == 0.0:
+                wait.expired = True
+            elif wait.patience < math.inf and wait.cancel_end is None:
+                wait.cancel_end = self._alarms.on(loop)(wait.patience, wait.expire)
         except BaseException:
             self.end(wait)
             raise
@@ -608,39 +628,21 @@ class Lookups:
         missing = cast(TransformLookupError, wait.blocked_by)
         raise LookupTimeoutError(target=target, source=source, timeout=wait.patience, missing=missing) from missing
 
-    def _set_end(self, wait: Wait, loop: Any) -> None:
-        """Set the alarm for the end of a wait, if it has an end and no alarm."""
-        if wait.patience < math.inf and wait.cancel_end is None and self._alarms is not None:
-            wait.cancel_end = self._alarms.on(loop)(wait.patience, wait.expire)
+    def _look_on(self, loop: Any, pause: float) -> None:
+        """Look at the lookups that hang after some time (s), unless a look on this loop is due."""
+        if self._looking_on is not loop:
+            self._look_after(max(pause, 0.0))
 
     def _look_after(self, pause: float) -> None:
         """Look at the lookups that hang after some time (s), unless that is infinite."""
         self._cancel_look()
         if self.feed is not None:
             self.feed.loop = None
-        if pause < math.inf and self._alarms is not None:
+        if pause < math.inf:
             self._looking_on = loop = running_loop()
             self._cancel_look = self._alarms.on(loop)(pause, lambda: self._look_after(self.report()))
         else:
             self._looking_on, self._cancel_look = None, _nothing
-
-    async def _wait_in_scopes(self, wait: Wait, last_reset: ClockResetError | None) -> TransformStamped:
-        """Wait for the answer by a clock that knows no alarms."""
-        found = self._ask(wait, last_reset)
-        pause = REPORT_AFTER
-        with self._clock.move_on_after(wait.patience):
-            while found is None:
-                with self._clock.move_on_after(pause):
-                    while found is None:
-                        try:
-                            await asleep(wait.sleep)
-                        finally:
-                            self.share.live.waiting.remove(wait)
-                        found = self._ask(wait, last_reset)
-                if found is None:
-                    found = self._ask(wait, last_reset)
-                    pause = min(self.report(), REPORT_AFTER)
-        return self._last_answer(wait, last_reset) if found is None else found
 
     def _check_names(self, question: Question) -> None:
         """Raise `UnknownFrameError` for a name that can never be the name of a frame."""

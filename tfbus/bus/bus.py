@@ -423,7 +423,7 @@ class Bus:
         stream = Stream(capacity, overflow, self._check_thread, self._detach_stream)
         latched = tuple(self._topology.latched.samples.values())
         if latched:
-            stream.put(latched)
+            stream.queue.put(latched)
         self._streams.append(stream)
         return stream
 
@@ -574,7 +574,9 @@ class Bus:
             If neither the bus nor a buffer knows the frame.
         """
         self._check_usable()
-        if not self._knows(frame) and not any(frame in live.forest.names for live in self._trees):
+        topology = self._topology
+        known = frame in topology or frame in topology.names
+        if not known and not any(frame in live.forest.names for live in self._trees):
             raise UnknownFrameError(frame=frame, known=self._topology.names.some())
         self._removals += 1
         self._topology.remove(frame)
@@ -698,7 +700,8 @@ class Bus:
 
     def _put_into_streams(self, batch: Batch) -> None:
         for stream in self._streams:
-            stream.put(batch)
+            stream.queue.put(batch)
+            stream.wake()
 
     def _note_in_events(self, batch: Batch) -> None:
         for events in self._events:
@@ -707,10 +710,6 @@ class Bus:
     def _remove_if_known(self, frame: str) -> None:
         with suppress(UnknownFrameError):
             self.remove_frame(frame)
-
-    def _knows(self, frame: str) -> bool:
-        """Whether the bus has had a sample that names a frame, and has not removed it. Called by buffers."""
-        return frame in self._topology or frame in self._topology.names
 
     def _newest_plausible(self) -> int:
         """The greatest stamp, in ns, that is not ahead of the clock now. Called by buffers."""

@@ -75,17 +75,20 @@ class SampleQueue:
         if self.overflow == "conflate":
             newest = self._newest
             for sample in batch:
-                _, child, stamp, _, _, static = sample._fields
+                child, static = sample.child, sample.static
                 pending = newest.get(child)
-                if pending is None:
+                if pending is None or pending.static:
                     self._moving += not static
                 else:
-                    self.conflated += not pending.static
+                    self.conflated += 1
                     # The last kind wins; among moving samples, the newest stamp wins.
-                    if not (static or pending.static) and stamp < pending.stamp:
+                    if static:
+                        self._moving -= 1
+                    elif sample.stamp < pending.stamp:
                         continue
+                if pending is not None:
+                    # The new one comes behind the others.
                     del newest[child]
-                    self._moving += pending.static - static
                 newest[child] = sample
             if self._moving > self.capacity:
                 self._drop_children()
@@ -200,11 +203,6 @@ class Stream(OneReaderStream[Batch]):
     def dropped(self) -> int:
         """Number of moving samples that were dropped because the reader was too slow."""
         return self.queue.dropped
-
-    def put(self, batch: Batch) -> None:
-        """Add a batch and wake the reader."""
-        self.queue.put(batch)
-        self.wake()
 
     def _next(self) -> Batch | None:
         return self.queue.get()

@@ -187,7 +187,7 @@ class Subscribers:
             self._removal_callbacks[key] = removed
         if latched:
             self._call(key, callback, latched)
-            self._deliver_backlog()
+            self.deliver()
         return Registration(lambda: self._remove(key))
 
     def check_backlog(self) -> None:
@@ -198,17 +198,35 @@ class Subscribers:
                 "behind the one that it was called with"
             )
 
-    def deliver(self, batch: Batch) -> None:
-        """Call every subscriber with a batch: now or, inside a callback, after the batches before it."""
-        if self.calling:
-            self._backlog.append(batch)
-            self._queued += 1
-            return
-        if self._backlog:
-            # Ctrl-C has left some.
-            self._backlog.append(batch)
+    def deliver(self, batch: Batch = ()) -> None:
+        """Call every subscriber with the batches that wait and this one: now, or when the callbacks that run return."""
+        callbacks, calling = self.callbacks, self.calling
+        if calling or self._backlog:
+            if batch:
+                self._backlog.append(batch)
+            if calling:
+                self._queued += len(batch) > 0
+                return
             batch = self._backlog.popleft()
-        self._give(batch)
+        try:
+            while batch:
+                self._current = batch
+                for key, callback in self._in_order:
+                    # A callback may have closed another registration, or removed a frame of the batch.
+                    if key not in callbacks or not self._current:
+                        continue
+                    # As `_call`, without a function of Python for each callback.
+                    calling.append(callback)
+                    try:
+                        callback(self._current)
+                    except Exception as error:  # noqa: BLE001 - a subscriber must not stop the publisher
+                        self._note_failure(key, callback, error)
+                    finally:
+                        calling.pop()
+                batch = self._backlog.popleft() if self._backlog else ()
+        finally:
+            self._current = ()
+            self._queued = 0
 
     def discard_moving(self) -> None:
         """Take the moving samples out of the batches that are not delivered yet: the clock has jumped back."""
@@ -223,34 +241,12 @@ class Subscribers:
         for key, removed in tuple(self._removal_callbacks.items()):
             if key in self._removal_callbacks:
                 self._call(key, removed, child)
-        self._deliver_backlog()
+        self.deliver()
 
     def _keep_only(self, wanted: Callable[[TransformStamped], bool]) -> None:
         self._current = tuple(filter(wanted, self._current))
         batches = (tuple(filter(wanted, batch)) for batch in self._backlog)
         self._backlog = deque(batch for batch in batches if batch)
-
-    def _deliver_backlog(self) -> None:
-        """Deliver all batches, unless a callback runs: then its caller delivers them."""
-        if self._backlog and not self.calling:
-            self._give(self._backlog.popleft())
-
-    def _give(self, batch: Batch) -> None:
-        """Call every subscriber with a batch, then with those of the backlog."""
-        callbacks = self.callbacks
-        try:
-            while True:
-                self._current = batch
-                for key, callback in self._in_order:
-                    # A callback may have closed another registration, or removed a frame of the batch.
-                    if key in callbacks and self._current:
-                        self._call(key, callback, self._current)
-                if not self._backlog:
-                    return
-                batch = self._backlog.popleft()
-        finally:
-            self._current = ()
-            self._queued = 0
 
     def _remove(self, key: int) -> None:
         self.callbacks.pop(key, None)
@@ -262,12 +258,15 @@ class Subscribers:
         try:
             callback(given)
         except Exception as error:  # noqa: BLE001 - a subscriber must not stop the publisher
-            self.failures += 1
-            self._log.warning(("subscriber", key), "the subscriber %s raised", _name(callback), exc_info=error)
-            if self._announcer.has_listeners:
-                self._announcer.announce(SubscriberFailed(self._announcer.now(), _name(callback), error))
+            self._note_failure(key, callback, error)
         finally:
             self.calling.pop()
+
+    def _note_failure(self, key: int, callback: Callable[..., object], error: Exception) -> None:
+        self.failures += 1
+        self._log.warning(("subscriber", key), "the subscriber %s raised", _name(callback), exc_info=error)
+        if self._announcer.has_listeners:
+            self._announcer.announce(SubscriberFailed(self._announcer.now(), _name(callback), error))
 
 
 def _name(callback: Callable[..., object]) -> str:

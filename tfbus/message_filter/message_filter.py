@@ -45,7 +45,7 @@ import anyio.lowlevel
 from tfbus._aio.loops import checkpoint
 from tfbus._aio.task_groups import OneReader, close_task_group, raise_unchanged
 from tfbus.buffer.buffer import Buffer
-from tfbus.buffer.lookups import REPORT_AFTER, Wait
+from tfbus.buffer.lookups import Wait
 from tfbus.bus.queues import check_capacity
 from tfbus.bus.subscribers import OnceLogger
 from tfbus.errors import (
@@ -696,11 +696,7 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
             wait = pending.wait = Wait((), self.buffer.bus.clock.now(), partial(self._woken, pending))
             wait.patience = self._timeout
         wait.asked, *wait.others = [self.buffer._on_bus(Question(*asked)) for asked in questions]
-        waits = self._lookups.park(wait, error)
-        if waits and wait.cancel_end is None and not self._lookups.has_alarms and self._tasks is not None:
-            self._tasks.start_soon(self._keep_time, wait, scope := anyio.CancelScope())
-            wait.cancel_end = scope.cancel
-        return waits
+        return self._lookups.park(wait, error)
 
     def _woken(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
         """Take the answer of an insertion, or let the attendant ask again. Called inside a publish, or by an alarm."""
@@ -728,16 +724,6 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
                 except TransformError as error:
                     self._drop(pending, reason_of(error), error)
             self._due.pop(pending, None)
-
-    async def _keep_time(self, wait: Wait, scope: anyio.CancelScope) -> None:
-        """Log a wait that takes long, and end it after the timeout, by a clock that knows no alarms."""
-        clock = self.buffer.bus.clock
-        with scope:
-            with clock.move_on_after(self._timeout):
-                while True:
-                    await clock.sleep(REPORT_AFTER)
-                    self._lookups.report()
-            wait.expire()
 
     def _blocker(self, pending: PendingMessage[MessageT, AnswerT]) -> TransformLookupError | None:
         """The error that blocks a message now; None for one with an answer."""

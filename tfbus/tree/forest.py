@@ -43,26 +43,27 @@ class KnownFrames:
 
     Attributes
     ----------
+    frames : dict of str to None
+        All names.
     changing : int
         The number of children whose samples name several parents.
     """
 
-    __slots__ = ("_mentions", "_parents_of", "_roots", "_some", "_sorted", "changing")
+    __slots__ = ("_mentions", "_parents_of", "_some", "_sorted", "changing", "frames")
 
     def __init__(self) -> None:
         self._parents_of: dict[str, tuple[str, ...]] = {}
         self._mentions: dict[str, int] = {}
+        self.frames: dict[str, None] = {}
         self.changing = 0
-        # Parents without a parent of their own.
-        self._roots: set[str] = set()
         self._sorted: tuple[str, ...] | None = None
         self._some: tuple[str, ...] | None = None
 
     def __len__(self) -> int:
-        return len(self._parents_of) + len(self._roots)
+        return len(self.frames)
 
     def __contains__(self, frame: object) -> bool:
-        return frame in self._parents_of or frame in self._mentions
+        return frame in self.frames
 
     @property
     def parents(self) -> Collection[str]:
@@ -76,14 +77,12 @@ class KnownFrames:
         if before == parents:
             return
         for parent in parents:
-            mentioned = mentions.get(parent, 0)
-            mentions[parent] = mentioned + 1
-            if not mentioned and parent not in parents_of:
-                self._roots.add(parent)
+            mentions[parent] = mentions.get(parent, 0) + 1
+            self.frames[parent] = None
         self.changing += len(parents) > 1
         parents_of[child] = parents
         if before is None:
-            self._roots.discard(child)
+            self.frames[child] = None
         else:
             self._forget_mentions(before)
         self._sorted = self._some = None
@@ -91,8 +90,8 @@ class KnownFrames:
     def remove(self, child: str) -> None:
         """Note that no sample of `child` is left."""
         parents = self._parents_of.pop(child)
-        if child in self._mentions:
-            self._roots.add(child)
+        if child not in self._mentions:
+            del self.frames[child]
         self._forget_mentions(parents)
         self._sorted = self._some = None
 
@@ -101,7 +100,7 @@ class KnownFrames:
         more = Counter(changes.values())
         more.subtract(parent for child in changes for parent in self._parents_of.get(child, ()))
         new = [child for child in changes if child not in self._parents_of]
-        count = len(self) + sum(child not in self._roots for child in new)
+        count = len(self) + sum(child not in self.frames for child in new)
         for parent, difference in more.items():
             if parent not in self._parents_of and parent not in changes:
                 before = self._mentions.get(parent, 0)
@@ -111,7 +110,7 @@ class KnownFrames:
     def sorted(self) -> tuple[str, ...]:
         """All names in alphabetical order."""
         if self._sorted is None:
-            self._sorted = tuple(sorted({*self._parents_of, *self._mentions}))
+            self._sorted = tuple(sorted(self.frames))
         return self._sorted
 
     def some(self) -> tuple[str, ...]:
@@ -126,7 +125,7 @@ class KnownFrames:
         twin = KnownFrames()
         twin._parents_of = self._parents_of.copy()
         twin._mentions = self._mentions.copy()
-        twin._roots = self._roots.copy()
+        twin.frames = self.frames.copy()
         twin.changing = self.changing
         return twin
 
@@ -136,7 +135,8 @@ class KnownFrames:
             self._mentions[parent] -= 1
             if not self._mentions[parent]:
                 del self._mentions[parent]
-                self._roots.discard(parent)
+                if parent not in self._parents_of:
+                    del self.frames[parent]
 
 
 Step = FrameHistory | Row
@@ -778,7 +778,8 @@ class Forest:
         if self.paths.holds(target, source) or (target, source) in self.changing_paths:
             return True
         structure = self.structure
-        if target not in self.names or source not in self.names:
+        names = self.names.frames
+        if target not in names or source not in names:
             return False
         try:
             edges = find_edges(self.frames, target, source, None)
@@ -857,7 +858,7 @@ class Forest:
 
     def check_known(self, frame: str) -> None:
         """Raise `UnknownFrameError` unless a sample names the frame, `TypeError` unless it is a string."""
-        if frame not in self.names:
+        if frame not in self.names.frames:
             if not isinstance(frame, str):
                 raise TypeError(f"a frame name must be a str, not {frame!r}")
             raise error_of(UnknownFrameError, {"frame": frame, "_known": self.names.some()})
