@@ -50,8 +50,8 @@ class Ticks:
             raise TypeError(f"a rate must be a number in Hz, not {hz!r}")
         if not (math.isfinite(hz) and hz > 0):
             raise ValueError(f"a rate must be greater than zero and finite, got {hz!r} Hz")
-        self.hz = float(hz)
-        self.skipped = 0
+        self.hz: float = float(hz)
+        self.skipped: int = 0
         self._elapsed = elapsed
         self._sleep_until = sleep_until
         self._start: int | None = None

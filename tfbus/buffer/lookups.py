@@ -69,7 +69,7 @@ class LoopTimer:
 
     def __init__(self, loop: Any, callback: Callable[[], object]) -> None:
         self.loop = loop
-        self.due = math.inf
+        self.due: float = math.inf
         self._callback = callback
         self._trio = None if hasattr(loop, "call_at") else cast(Any, sys.modules["trio"])
         self._handle: Any = None
@@ -216,7 +216,7 @@ class AlarmHeap:
     """The alarms on one event loop by their times, with one timer for the first."""
 
     def __init__(self, loop: Any) -> None:
-        self.timer = LoopTimer(loop, self._ring)
+        self.timer: LoopTimer = LoopTimer(loop, self._ring)
         self._now = self.timer.now
         # With a list of the callback, which is empty once the call is made or cancelled.
         self._alarms: list[tuple[float, int, list[Callable[[], object]]]] = []
@@ -339,7 +339,7 @@ class Wait(Waiter):
     """A lookup that waits, from its first error to its end."""
 
     sleep: Generator[Any, None, None]
-    expired = False
+    expired: bool = False
 
     def expire(self) -> None:
         """End the wait."""
@@ -382,7 +382,7 @@ class Lookups:
         self.bus = bus
         self._clock = bus.clock
         # One call less, as each wait notes when it began.
-        self.now = time_ns if type(bus.clock) is SystemClock else bus.clock.now
+        self.now: Callable[[], int] = time_ns if type(bus.clock) is SystemClock else bus.clock.now
         self._is_here = bus._is_here
         self._local_names = local_names
         self._alarms = alarms_of(bus.clock)
@@ -390,7 +390,7 @@ class Lookups:
         # The loop on which the next look at the lookups that hang is due, if one is, and the function that cancels it.
         self._looking_on: Any = None
         self._cancel_look: Cancel = _nothing
-        self.feed = share.feed
+        self.feed: Any = share.feed
         if self.feed is not None:
             self.feed.kind, self.feed.here, self.feed.begin = Wait, here, self.begin
 

@@ -46,7 +46,7 @@ class Watch:
                 raise UnknownFrameError(frame=name, known=lookups.forest.some_frames())
         if question.max_age is not None:
             lookups.bounds(question.max_age, question.at, question.source_at)
-        self.skipped = 0
+        self.skipped: int = 0
         self._question = question
         self._min_translation = _threshold(min_translation, "min_translation", "m", math.inf)
         self._min_rotation = _threshold(min_rotation, "min_rotation", "rad", math.pi)

@@ -73,7 +73,7 @@ class TransformBroadcaster:
     ) -> None:
         if not isinstance(authority, str):
             raise TypeError(f"authority must be a str, not {authority!r}")
-        self.bus = bus if isinstance(bus, Bus) else bus.bus
+        self.bus: Bus = bus if isinstance(bus, Bus) else bus.bus
         self._to = bus
         self.authority = authority
         self._prefix = as_prefix(prefix, shared)

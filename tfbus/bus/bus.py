@@ -113,7 +113,7 @@ class OwnerThread:
             self._set(0)
 
     def _set(self, thread: int) -> None:
-        self.thread = thread
+        self.thread: int = thread
         if self._intake is not None:
             self._intake.thread = thread
 
@@ -779,7 +779,7 @@ class ThreadPublisher:
     """
 
     def __init__(self, bus: Bus, capacity: int) -> None:
-        self.queue = SampleQueue(capacity, "drop_oldest")
+        self.queue: SampleQueue = SampleQueue(capacity, "drop_oldest")
         self.bus = bus
         self._lock = threading.Lock()
         self._waker = LoopWaker(self._drain)

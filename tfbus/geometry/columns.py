@@ -78,7 +78,7 @@ class SampleColumns:
         self._bound = max_translation
         # A square this near to the bound can disagree with the length.
         square = 0.99 * max_translation**2
-        self.plain = columns(
+        self.plain: Any = columns(
             self._parents, self._children, self._stamps, self._rows, self._authority, self._static, square
         )
 

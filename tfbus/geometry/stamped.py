@@ -16,7 +16,7 @@ from tfbus.which_kernel import kernel
 if kernel == "python":
     from tfbus._python_kernel import Sample
 else:
-    from tfbus._kernel import Sample  # type: ignore[assignment]
+    from tfbus._kernel import Sample
 
 Fields = tuple[str, str, int, Row, str, bool]
 

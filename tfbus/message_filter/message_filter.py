@@ -95,7 +95,7 @@ class DroppedMessages(Generic[MessageT]):
         self._on_drop = on_drop
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self.counts: Counter[DropReason] = Counter()
-        self.callbacks_failed = 0
+        self.callbacks_failed: int = 0
 
     def drop(self, message: MessageT, reason: DropReason, error: TransformError | None) -> None:
         """Count a message and call the callback; its first `Exception` is logged."""
@@ -144,12 +144,12 @@ class PendingMessage(Generic[MessageT, AnswerT]):
     __slots__ = ("answer", "frame", "message", "number", "place", "stamp", "wait")
 
     def __init__(self, message: MessageT, frame: str, stamp: int | Latest) -> None:
-        self.message = message
-        self.frame = frame
-        self.stamp = stamp
+        self.message: MessageT = message
+        self.frame: str = frame
+        self.stamp: int | Latest = stamp
         self.answer: AnswerT | None = None
         self.wait: Wait | None = None
-        self.number = -1
+        self.number: int = -1
         self.place: tuple[int, int] | None = None
 
 
@@ -175,7 +175,7 @@ class MessageQueue(Generic[MessageT, AnswerT]):
             raise ValueError(f"order must be 'ready', 'stamp' or 'arrival', not {order!r}")
         self.capacity = capacity
         self.order: Order = order
-        self.unanswered = 0
+        self.unanswered: int = 0
         self._arrivals = count()
         self._pending: dict[int, PendingMessage[MessageT, AnswerT]] = {}
         # The places in the order of delivery; with "ready", only the places of answered messages.
@@ -287,7 +287,7 @@ class Targets(Generic[AnswerT]):
 
     def __init__(self, buffer: Buffer, target: str | Sequence[str], tolerance: float) -> None:
         self._buffer = buffer
-        self.one = isinstance(target, str)
+        self.one: bool = isinstance(target, str)
         self._tolerance = from_seconds(as_duration(tolerance, "margin"))
         self.replace(target)
 

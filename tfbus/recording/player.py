@@ -182,15 +182,15 @@ class Player:
         if self._since is not None and self._until is not None and self._until < self._since:
             raise ValueError(f"the range must not end before it begins, at {since}, got {until}")
         self.bus = bus
-        self.path = os.fspath(path)
+        self.path: str = os.fspath(path)
         self._rate = float(rate)
         self.loop = loop
         self.start: int | None = None
         self.end: int | None = None
         self.position: int | None = None
-        self.played = 0
-        self.messages = 0
-        self.passes = 0
+        self.played: int = 0
+        self.messages: int = 0
+        self.passes: int = 0
         self.bad: Counter[str] = Counter()
         self._simulated = bus.clock if isinstance(bus.clock, SimulatedClock) else None
         self._playing = False

@@ -127,7 +127,7 @@ class Recorder(AsyncOnly):
         self, bus: Bus, path: str | os.PathLike[str], *, capacity: int = 100_000, overwrite: bool = False
     ) -> None:
         self.bus = bus
-        self.path = os.fspath(path)
+        self.path: str = os.fspath(path)
         self.error: Exception | None = None
         self._overwrite = overwrite
         self._queue = WriteQueue(capacity)

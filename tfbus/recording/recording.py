@@ -245,7 +245,7 @@ class Recording:
 
     def __init__(self, path: Path, storage: Storage, selection: Selection) -> None:
         self.path = path
-        self.finished = storage.finished
+        self.finished: bool = storage.finished
         self._storage: Storage | None = storage
         self._selection = selection
         self._decoders: dict[Channel, ChannelDecoder] = {}

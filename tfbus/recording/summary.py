@@ -133,8 +133,8 @@ class Periods:
         for column in columns:
             if (column[1:] < column[:-1]).any():
                 column.sort()
-        self.oldest = min((int(column[0]) for column in columns), default=None)
-        self.newest = max((int(column[-1]) for column in columns), default=None)
+        self.oldest: int | None = min((int(column[0]) for column in columns), default=None)
+        self.newest: int | None = max((int(column[-1]) for column in columns), default=None)
         self._durations = Durations()
         self._different = 0
         total = sum(map(len, columns))
@@ -153,7 +153,7 @@ class Periods:
             merged = np.sort(np.concatenate(parts))
             before = self._add(merged[np.append(True, merged[1:] != merged[:-1])] if len(merged) else merged, before)
         maximum = None if self._different < 2 else self._durations.spread()
-        self.longest = None if maximum is None else maximum.max
+        self.longest: float | None = None if maximum is None else maximum.max
 
     def _add(self, stamps: npt.NDArray[np.int64], before: int | None) -> int | None:
         """Count the periods of different stamps that ascend; returns the last stamp."""

@@ -256,9 +256,9 @@ class Extrapolation:
     __slots__ = ("extrapolated_by", "gap", "policy")
 
     def __init__(self, policy: Policy) -> None:
-        self.policy = policy
-        self.extrapolated_by = 0
-        self.gap = 0
+        self.policy: Policy = policy
+        self.extrapolated_by: int = 0
+        self.gap: int = 0
 
     def row(self, path: Path, at: int) -> Row:
         """Source in target along a path.

@@ -88,7 +88,7 @@ class TransformTree:
 
     def __init__(self, keep: float | None = 10.0, *, max_translation: float = MAX_TRANSLATION) -> None:
         self.keep = keep
-        self.max_translation = as_max_translation(max_translation)
+        self.max_translation: float = as_max_translation(max_translation)
         self._stand_on(Forest(window_of(keep)))
         self._filled_by_bus = False
 

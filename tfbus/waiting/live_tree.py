@@ -250,8 +250,8 @@ class WaitingIndex:
         # waiter that is in it.
         self._by_name: dict[str, dict[Waiter, None]] = {}
         self.limits: list[Place] = []
-        self.passed = STAMP_MIN
-        self.orders = count()
+        self.passed: int = STAMP_MIN
+        self.orders: count[int] = count()
 
     def __len__(self) -> int:
         return len(self.parked)
@@ -485,17 +485,17 @@ class LiveTree:
     def __init__(self, forest: Forest, on_loop: Callable[[LoopingSample], object] | None = None) -> None:
         self.forest = forest
         self._on_loop = on_loop
-        self.waiting = WaitingIndex()
-        self.watching = WatchIndex()
+        self.waiting: WaitingIndex = WaitingIndex()
+        self.watching: WatchIndex = WatchIndex()
         self.last_reset: ClockResetError | None = None
         self.tell_expired: Callable[[TransformStamped, int, str], bool] = lambda _sample, _newest, _authority: False
-        self.expired_ahead = 0
+        self.expired_ahead: int = 0
         self.superseded = 0
         self._waiters = self.waiting.by_frame
         self._watches = self.watching.by_frame
         # The readers of the forest for buffers that were closed since the last change.
         self._closed: list[ref[ReadsForest]] = []
-        self.feed = self.make_feed()
+        self.feed: Any = self.make_feed()
 
     def make_feed(self) -> Any:
         """A `Feed` of this tree; None without the compiled kernel."""
@@ -677,7 +677,7 @@ class Share:
     def __init__(self, live: LiveTree, before: BufferStatistics) -> None:
         self.live = live
         self.end_reason: str | None = None
-        self.feed = live.make_feed()
+        self.feed: Any = live.make_feed()
         if self.feed is not None:
             self.feed.share = self
         self._end_callbacks: dict[Registration, Callable[[], object]] = {}
