@@ -113,7 +113,8 @@ class Judge:
     def __init__(self, edges: Mapping[str, Edge], square: float) -> None:
         self._edges = edges
         self._square = square
-        self.earliest = self.horizon = STAMP_MIN
+        self.earliest: int = STAMP_MIN
+        self.horizon: int = STAMP_MIN
         self._until = STAMP_MAX
         self.behind: int = 0
 

@@ -1,5 +1,7 @@
 """The buffer: a tree that a bus fills, and lookups that wait for missing transforms."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -98,7 +100,7 @@ class Buffer:
         *,
         prefix: str | None = None,
         shared: Iterable[str] = (),
-        prefill: "Buffer | TransformTree | None" = None,
+        prefill: Buffer | TransformTree | None = None,
     ) -> None:
         self.bus = bus
         self._clock = bus.clock
@@ -110,7 +112,7 @@ class Buffer:
         self._lookups = Lookups(self._share, bus, self._local_names)
         self._stand_on(self._share.live.forest)
 
-    def _prefilled(self, prefill: "Buffer | TransformTree | None", window: int | None) -> Forest | LiveTree | None:
+    def _prefilled(self, prefill: Buffer | TransformTree | None, window: int | None) -> Forest | LiveTree | None:
         """Nothing to begin with, or the live tree of a buffer that has all it would have, or a copy of a buffer."""
         if prefill is None:
             return None
@@ -434,13 +436,24 @@ class Buffer:
         return do_transform(data, self._lookups.lookup_nowait(self._on_bus(question)))
 
     async def can_transform_within(
-        self, target: str, source: str, timeout: float | None, at: AtLike = LATEST, **question: Any
+        self,
+        target: str,
+        source: str,
+        timeout: float | None,
+        at: AtLike = LATEST,
+        *,
+        max_age: float | None = None,
+        source_at: AtLike | None = None,
+        fixed: str | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
     ) -> bool:
         """Whether `lookup` with the same arguments has an answer within a time; tf2's ``can_transform`` with a timeout.
 
         Parameters
         ----------
-        target, source, at, question
+        target, source, at, max_age, source_at, fixed, tolerance, max_gap, extrapolate
             As `lookup`.
         timeout : float or None
             In s, on the bus's clock; None waits for ever.
@@ -456,18 +469,53 @@ class Buffer:
             As `lookup`.
         """
         try:
-            await self.lookup(target, source, at, timeout=timeout, **question)
+            await self.lookup(
+                target,
+                source,
+                at,
+                timeout=timeout,
+                max_age=max_age,
+                source_at=source_at,
+                fixed=fixed,
+                tolerance=tolerance,
+                max_gap=max_gap,
+                extrapolate=extrapolate,
+            )
         except TransformLookupError:
             return False
         return True
 
-    def can_transform(self, target: str, source: str, at: AtLike = LATEST, **question: Any) -> bool:
+    def can_transform(
+        self,
+        target: str,
+        source: str,
+        at: AtLike = LATEST,
+        *,
+        max_age: float | None = None,
+        source_at: AtLike | None = None,
+        fixed: str | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> bool:
         """Whether `lookup_nowait` with the same arguments has an answer now."""
-        known = None if question else self._paths.can_answer(target, source, at)
-        if known is not None:
-            return known
+        travels = source_at is not None or fixed is not None
+        if not (travels or tolerance or max_age is not None or max_gap is not None or extrapolate is not None):
+            known = self._paths.can_answer(target, source, at)
+            if known is not None:
+                return known
         try:
-            self.lookup_nowait(target, source, at, **question)
+            self.lookup_nowait(
+                target,
+                source,
+                at,
+                max_age=max_age,
+                source_at=source_at,
+                fixed=fixed,
+                tolerance=tolerance,
+                max_gap=max_gap,
+                extrapolate=extrapolate,
+            )
         except TransformLookupError:
             return False
         return True
@@ -626,7 +674,7 @@ class Buffer:
         """A question with the names of the bus."""
         return question if self._local_names is None else self._local_names.question(question)
 
-    def __enter__(self) -> "Buffer":
+    def __enter__(self) -> Buffer:
         return self
 
     def __exit__(

@@ -44,6 +44,7 @@ from tfbus.frames import Prefix, is_frame
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_duration, from_seconds, to_seconds
 from tfbus.tree.explanation import Explanation
+from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
 from tfbus.tree.lookup import Bounds, Question, answer
 from tfbus.waiting.live_tree import PendingLookup, Share, Waiter, without_traceback
@@ -378,7 +379,7 @@ class Lookups:
         local_names: LocalNames | None = None,
     ) -> None:
         self.share = share
-        self.forest = share.live.forest
+        self.forest: Forest = share.live.forest
         self.bus = bus
         self._clock = bus.clock
         # One call less, as each wait notes when it began.

@@ -1,5 +1,7 @@
 """A publisher of transforms under one authority."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 

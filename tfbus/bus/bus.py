@@ -5,6 +5,8 @@ every buffer, wakes the lookups that waited for it, then calls the subscribers. 
 nothing can be lost between "sent" and "buffered".
 """
 
+from __future__ import annotations
+
 import asyncio
 import logging
 import os
@@ -492,7 +494,7 @@ class Bus:
         self._check_usable()
         return self._topology.reserve(frame, authority)
 
-    def threadsafe(self, capacity: int = 10_000) -> "ThreadPublisher":
+    def threadsafe(self, capacity: int = 10_000) -> ThreadPublisher:
         """A function to publish from other threads: ``with bus.threadsafe() as publish``, entered on the event loop.
 
         ``publish(samples)`` may then be called from any thread. The bus publishes the queued batches with
@@ -644,7 +646,7 @@ class Bus:
         for share in shares:
             share.call_end_callbacks()
 
-    def __enter__(self) -> "Bus":
+    def __enter__(self) -> Bus:
         return self
 
     def __exit__(
@@ -785,7 +787,7 @@ class ThreadPublisher:
         self._waker = LoopWaker(self._drain)
         self._ended = False
 
-    def __enter__(self) -> "ThreadPublisher":
+    def __enter__(self) -> ThreadPublisher:
         self._waker.bind()
         try:
             self.bus._check_usable()

@@ -1,5 +1,7 @@
 """Points, directions, orientations and poses."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Data with a linear and an angular part: poses with covariance, twists and wrenches."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 

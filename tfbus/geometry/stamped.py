@@ -1,5 +1,7 @@
 """`TransformStamped`, a transform between two frames at an instant, and batches of such samples."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -115,7 +117,7 @@ class TransformStamped(Sample):
         """The time in ns between the samples that an answer was interpolated from; None without a policy."""
         return None
 
-    def replace(self, **changes: Any) -> "TransformStamped":
+    def replace(self, **changes: Any) -> TransformStamped:
         """A copy with some fields changed; all fields are checked again."""
         parent, child, stamp, row, authority, static = self._fields
         fields = {
@@ -142,7 +144,7 @@ class TransformStamped(Sample):
         }
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "TransformStamped":
+    def from_dict(cls, data: Mapping[str, Any]) -> TransformStamped:
         """The sample or answer from which `to_dict` made `data`.
 
         Raises

@@ -8,6 +8,8 @@ conversion start sooner without it.
 A transform holds one tuple of seven floats, a row; `tfbus.rows` has the arithmetic.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, overload
@@ -79,18 +81,18 @@ class Transform:
         self._row = (*as_vector(translation, "translation"), *as_rotation(rotation, "rotation"))
 
     @classmethod
-    def identity(cls) -> "Transform":
+    def identity(cls) -> Transform:
         """The transform that changes nothing."""
         return from_row(IDENTITY)
 
     @classmethod
-    def from_wxyz(cls, translation: Numbers, wxyz: Numbers) -> "Transform":
+    def from_wxyz(cls, translation: Numbers, wxyz: Numbers) -> Transform:
         """From a translation in m and a unit quaternion in transforms3d's order, (w, x, y, z)."""
         w, x, y, z = as_floats(wxyz, 4, "rotation")
         return cls(translation, (x, y, z, w))
 
     @classmethod
-    def from_matrix(cls, matrix: npt.ArrayLike) -> "Transform":
+    def from_matrix(cls, matrix: npt.ArrayLike) -> Transform:
         """From a homogeneous matrix of shape (4, 4).
 
         The quaternion has w >= 0. If the rotation part is within 1 % of a rotation, it is projected on the nearest one
@@ -122,7 +124,7 @@ class Transform:
         return cls.from_wxyz(m[:3, 3], mat2quat(r))
 
     @classmethod
-    def from_xyz_rpy(cls, xyz: Numbers, rpy: Numbers, *, degrees: bool = False) -> "Transform":
+    def from_xyz_rpy(cls, xyz: Numbers, rpy: Numbers, *, degrees: bool = False) -> Transform:
         """From a translation in m and roll, pitch, yaw about the fixed axes x, y, z, as in URDF.
 
         Parameters
@@ -152,7 +154,7 @@ class Transform:
         return cls.from_wxyz(xyz, euler2quat(roll, pitch, yaw, "sxyz"))
 
     @classmethod
-    def from_axis_angle(cls, axis: Numbers, angle: float, translation: Numbers = (0.0, 0.0, 0.0)) -> "Transform":
+    def from_axis_angle(cls, axis: Numbers, angle: float, translation: Numbers = (0.0, 0.0, 0.0)) -> Transform:
         """From a rotation by `angle` (rad) about `axis` (any length but zero), and a translation in m."""
         from transforms3d.quaternions import axangle2quat
 
@@ -165,12 +167,12 @@ class Transform:
         return cls.from_wxyz(translation, axangle2quat((x / length, y / length, z / length), angle, True))
 
     @classmethod
-    def from_scipy(cls, translation: Numbers, rotation: Any) -> "Transform":
+    def from_scipy(cls, translation: Numbers, rotation: Any) -> Transform:
         """From a translation in m and one ``scipy.spatial.transform.Rotation``."""
         return cls(translation, rotation.as_quat())
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Transform":
+    def from_dict(cls, data: Mapping[str, Any]) -> Transform:
         """The transform from which `to_dict` made `data`; `ValueError` if the data are not a transform."""
         return cls(**from_fields(cls, data, {"translation": Vector, "rotation": Quaternion}))
 
@@ -238,11 +240,11 @@ class Transform:
         """A new homogeneous matrix of shape (4, 4)."""
         return fill_matrix(self._row, np.empty((4, 4)))
 
-    def inverse(self) -> "Transform":
+    def inverse(self) -> Transform:
         """The transform that undoes this one."""
         return from_row(invert_row(self._row))
 
-    def __matmul__(self, other: "Transform") -> "Transform":
+    def __matmul__(self, other: Transform) -> Transform:
         if not isinstance(other, Transform):
             return NotImplemented
         return from_row(compose_rows(self._row, other._row))
@@ -290,7 +292,7 @@ class Transform:
             _python_kernel.move_points(self._row, points, out)
         return out
 
-    def interpolate(self, other: "Transform", fraction: float) -> "Transform":
+    def interpolate(self, other: Transform, fraction: float) -> Transform:
         """The transform a `fraction` of the way to `other`: translation linear, rotation along the shorter arc.
 
         Raises
@@ -303,7 +305,7 @@ class Transform:
         return from_row(interpolate(self._row, other._row, float(fraction)))
 
     def is_close(
-        self, other: "Transform", *, translation_tolerance: float = 1e-9, rotation_tolerance: float = 1e-9
+        self, other: Transform, *, translation_tolerance: float = 1e-9, rotation_tolerance: float = 1e-9
     ) -> bool:
         """Whether the transforms are equal within tolerances; quaternions are compared up to their sign.
 

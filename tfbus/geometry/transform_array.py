@@ -4,6 +4,8 @@ It holds seven columns, ``tx, ty, tz, qx, qy, qz, qw``, each an array over the t
 `tfbus.rows` take columns as well as the seven floats of a row, so each formula is written once.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from importlib import import_module
@@ -120,7 +122,7 @@ class TransformArray:
     @classmethod
     def from_scipy(
         cls, translations: npt.ArrayLike, rotations: Any, stamps: StampsLike | None = None
-    ) -> "TransformArray":
+    ) -> TransformArray:
         """From translations in m, shape (n, 3), and n rotations in a ``scipy.spatial.transform.Rotation``."""
         return cls(translations, rotations.as_quat(), stamps)
 
@@ -273,11 +275,11 @@ class TransformArray:
             moved.T[:] = move((*self._columns,), *array.T.astype(np.float64))
         return moved
 
-    def inverse(self) -> "TransformArray":
+    def inverse(self) -> TransformArray:
         """The inverse of each transform at the same stamp, without `extrapolated_by` and `gap`."""
         return from_columns(np.stack(invert((*self._columns,))), stamps=self._stamps)
 
-    def __matmul__(self, other: "TransformArray | Transform") -> "TransformArray":
+    def __matmul__(self, other: TransformArray | Transform) -> TransformArray:
         """Compose with `other` one by one, or all with the same transform, without `extrapolated_by` and `gap`.
 
         If only one operand has stamps, the product has them. If both have stamps that differ, it has none.
@@ -290,7 +292,7 @@ class TransformArray:
             stamps = other._stamps if stamps is None or np.array_equal(stamps, other._stamps) else None
         return from_columns(np.stack(compose((*self._columns,), columns)), stamps=stamps)
 
-    def __rmatmul__(self, other: Transform) -> "TransformArray":
+    def __rmatmul__(self, other: Transform) -> TransformArray:
         columns = _columns_of(other, len(self))
         if columns is None:
             return NotImplemented
@@ -302,8 +304,8 @@ class TransformArray:
     @overload
     def __getitem__(self, index: int | np.integer[Any]) -> Transform: ...
     @overload
-    def __getitem__(self, index: slice | list[int] | list[bool] | npt.NDArray[Any]) -> "TransformArray": ...
-    def __getitem__(self, index: Any) -> "Transform | TransformArray":
+    def __getitem__(self, index: slice | list[int] | list[bool] | npt.NDArray[Any]) -> TransformArray: ...
+    def __getitem__(self, index: Any) -> Transform | TransformArray:
         """One transform, or those selected by a slice, a mask or indices in a list or an array.
 
         Raises

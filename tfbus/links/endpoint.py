@@ -164,7 +164,8 @@ class Endpoint(Outbox):
     def send(self) -> None:
         """Hand the gathered entries to the network, if there are any."""
         turn = Turn(self._entries, self._take_statics(), self.time if self._time_waits else None)
-        self._entries, self.pending, self._time_waits = [], 0, False
+        self._entries, self._time_waits = [], False
+        self.pending: int = 0
         if turn.entries or turn.statics or turn.time is not None:
             self._send(turn)
 

@@ -6,6 +6,8 @@ fails at the legacy transmissions of real robots. So it gets one element at a ti
 The XML itself is parsed here, with limits, because files may come from untrusted sources.
 """
 
+from __future__ import annotations
+
 import math
 import os
 from collections import Counter
@@ -671,7 +673,7 @@ class RobotModel:
         return f"<RobotModel {self.name!r}: {len(self.links)} links below {self.root!r}, {moving} moving joints>"
 
     @classmethod
-    def from_urdf(cls, source: str | os.PathLike[str]) -> "RobotModel":
+    def from_urdf(cls, source: str | os.PathLike[str]) -> RobotModel:
         """Read a URDF file, or its text.
 
         Elements other than links, joints and materials are ignored, such as ``<transmission>`` and ``<gazebo>``. Needs

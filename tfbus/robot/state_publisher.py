@@ -1,5 +1,7 @@
 """`RobotStatePublisher`, which sends a robot's fixed joints once, and its moving joints with each state."""
 
+from __future__ import annotations
+
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence

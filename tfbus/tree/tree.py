@@ -3,6 +3,8 @@
 `TransformTree` has no clock, no event loop and no input or output: it answers or it raises.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable
 from functools import partial
@@ -282,13 +284,40 @@ class TransformTree:
         bounds = bounds_of(not_before, not_after)
         return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
 
-    def can_transform(self, target: str, source: str, at: AtLike = LATEST, **question: Any) -> bool:
+    def can_transform(
+        self,
+        target: str,
+        source: str,
+        at: AtLike = LATEST,
+        *,
+        source_at: AtLike | None = None,
+        fixed: str | None = None,
+        not_before: StampLike | None = None,
+        not_after: StampLike | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> bool:
         """Whether `lookup` with the same arguments has an answer now."""
-        known = None if question else self._paths.can_answer(target, source, at)
-        if known is not None:
-            return known
+        travels = source_at is not None or fixed is not None
+        bounded = not_before is not None or not_after is not None
+        if not (travels or bounded or tolerance or max_gap is not None or extrapolate is not None):
+            known = self._paths.can_answer(target, source, at)
+            if known is not None:
+                return known
         try:
-            self.lookup(target, source, at, **question)
+            self.lookup(
+                target,
+                source,
+                at,
+                source_at=source_at,
+                fixed=fixed,
+                not_before=not_before,
+                not_after=not_after,
+                tolerance=tolerance,
+                max_gap=max_gap,
+                extrapolate=extrapolate,
+            )
         except TransformLookupError:
             return False
         return True
@@ -608,13 +637,13 @@ class TransformTree:
         self._check_writable("its samples leave it after `keep` seconds; or use a copy() of the tree")
         self._forest.rebuild(partial(save_frame, oldest=as_stamp(stamp)))
 
-    def copy(self) -> "TransformTree":
+    def copy(self) -> TransformTree:
         """An independent copy with the same samples, such as a snapshot to analyse elsewhere."""
         twin = TransformTree(self.keep, max_translation=self.max_translation)
         twin._stand_on(self._forest.copy())
         return twin
 
-    def __deepcopy__(self, memo: object) -> "TransformTree":
+    def __deepcopy__(self, memo: object) -> TransformTree:
         return self.copy()
 
     __copy__ = copy
