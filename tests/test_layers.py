@@ -70,6 +70,7 @@ EXTRAS = {
     "mcap_protobuf": ("recording.formats",),
     "pyarrow": ("cli",),
     "msgspec": ("view",),
+    "pydantic_core": ("plain",),
     "rich": ("cli", "view"),
     "rosbags": ("recording.formats",),
     "ruamel": ("recording.formats", "recording.static_frames"),

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 from tfbus.errors import InvalidTransformError
 from tfbus.frames import check_frame
 from tfbus.geometry.transform import Transform, from_row
-from tfbus.plain import from_fields, printable
+from tfbus.plain import StampsAs, from_fields, printable, schema_of, with_text
 from tfbus.rows import Row
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, StampLike, as_stamp, format_duration, format_stamp, is_real
 from tfbus.tf2_names import says_ours
@@ -23,6 +23,20 @@ else:
 Fields = tuple[str, str, int, Row, str, bool]
 
 _KINDS = {"parent": str, "child": str, "stamp": int, "transform": Transform, "authority": str, "static": bool}
+
+_POLICY_KINDS = {"extrapolated_by": int, "gap": int}
+
+
+class Changes(TypedDict, total=False):
+    """The fields of a `TransformStamped`, as `TransformStamped.replace` takes them."""
+
+    parent: str
+    child: str
+    stamp: StampLike
+    transform: Transform
+    authority: str
+    static: bool
+
 
 _NO_BEGINNING = ("", "/")
 """The first characters of strings that are not frame names."""
@@ -53,6 +67,7 @@ class TransformStamped(Sample):
     """
 
     __slots__ = ()
+    __match_args__ = ("parent", "child", "stamp", "transform", "authority", "static")
 
     def __init__(
         self,
@@ -117,10 +132,10 @@ class TransformStamped(Sample):
         """The time in ns between the samples that an answer was interpolated from; None without a policy."""
         return None
 
-    def replace(self, **changes: Any) -> TransformStamped:
+    def replace(self, **changes: Unpack[Changes]) -> TransformStamped:
         """A copy with some fields changed; all fields are checked again."""
         parent, child, stamp, row, authority, static = self._fields
-        fields = {
+        fields: Changes = {
             "parent": parent,
             "child": child,
             "stamp": stamp,
@@ -128,12 +143,18 @@ class TransformStamped(Sample):
             "authority": authority,
             "static": static,
         }
-        return TransformStamped(**{**fields, **changes})
+        fields.update(changes)
+        return TransformStamped(**fields)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON: ``"type"``, and the parameters under their names; the stamp is an ``int`` of ns."""
+    __replace__ = replace
+
+    def to_dict(self, *, stamps: StampsAs = "int") -> dict[str, Any]:
+        """Plain data for JSON: ``"type"``, and the parameters under their names; the stamp is an ``int`` of ns.
+
+        With ``stamps="text"`` it is text, for programs in JavaScript, whose numbers are not exact beyond 2**53.
+        """
         parent, child, stamp, row, authority, static = self._fields
-        return {
+        values = {
             "type": "TransformStamped",
             "parent": parent,
             "child": child,
@@ -142,6 +163,12 @@ class TransformStamped(Sample):
             "authority": authority,
             "static": static,
         }
+        return values if stamps == "int" else with_text(values, stamps)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _source: Any, handler: Any) -> Any:
+        defaults = {"type": None, "authority": "", "static": False, **dict.fromkeys(_POLICY_KINDS)}
+        return schema_of(TransformStamped, {**_KINDS, **_POLICY_KINDS}, defaults, handler)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TransformStamped:
@@ -152,7 +179,7 @@ class TransformStamped(Sample):
         ValueError
             If the data do not describe a `TransformStamped`. The message names the field.
         """
-        kinds = _KINDS if "gap" not in data else {**_KINDS, "extrapolated_by": int, "gap": int}
+        kinds = _KINDS if "gap" not in data else {**_KINDS, **_POLICY_KINDS}
         fields = from_fields(TransformStamped, data, kinds)
         policy_use = fields.pop("extrapolated_by", None), fields.pop("gap", None)
         target, source = fields["parent"], fields["child"]
@@ -200,9 +227,9 @@ class QualifiedTransform(TransformStamped):
         """The time in ns between two samples that were interpolated, on the edge where it is longest."""
         return self._policy_use[1]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self, *, stamps: StampsAs = "int") -> dict[str, Any]:
         """As `TransformStamped.to_dict`, with ``"extrapolated_by"`` and ``"gap"`` in ns."""
-        return {**super().to_dict(), "extrapolated_by": self.extrapolated_by, "gap": self.gap}
+        return {**super().to_dict(stamps=stamps), "extrapolated_by": self.extrapolated_by, "gap": self.gap}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (type(self), self._fields, self._policy_use), getattr(self, "__dict__", None)

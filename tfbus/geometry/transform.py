@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, overload
+from typing import Any, TypedDict, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from tfbus import _python_kernel
 from tfbus.errors import InvalidTransformError
-from tfbus.plain import from_fields
+from tfbus.plain import from_fields, schema_of
 from tfbus.rows import (
     IDENTITY,
     NORM_TOLERANCE,
@@ -36,6 +36,15 @@ from tfbus.rows import (
 )
 from tfbus.stamps import as_array
 from tfbus.which_kernel import compose_rows, fill_matrix, invert_row, move_point, move_points, row_of_matrix
+
+_KINDS = {"translation": Vector, "rotation": Quaternion}
+
+
+class Changes(TypedDict, total=False):
+    """The fields of a `Transform`, as `copy.replace` takes them."""
+
+    translation: Numbers
+    rotation: Numbers
 
 
 class Transform:
@@ -61,6 +70,7 @@ class Transform:
     """
 
     __slots__ = ("_row",)
+    __match_args__ = ("translation", "rotation")
     _row: Row
 
     def __init__(
@@ -174,7 +184,16 @@ class Transform:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Transform:
         """The transform from which `to_dict` made `data`; `ValueError` if the data are not a transform."""
-        return cls(**from_fields(cls, data, {"translation": Vector, "rotation": Quaternion}))
+        return cls(**from_fields(cls, data, _KINDS))
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _source: Any, handler: Any) -> Any:
+        return schema_of(Transform, _KINDS, {"type": None}, handler)
+
+    def __replace__(self, **changes: Unpack[Changes]) -> Transform:
+        fields: Changes = {"translation": self.translation, "rotation": self.rotation}
+        fields.update(changes)
+        return Transform(**fields)
 
     @property
     def translation(self) -> Vector:
