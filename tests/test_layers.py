@@ -47,8 +47,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "view": ("buffer", "recording", "robot"),
     "plot": ("recording",),
     "testing": ("geometry",),
-    "__init__": ("links", "message_filter", "recording", "testing"),
-    "cli": ("__init__", "links", "plot", "view"),
+    "__init__": ("links", "message_filter", "plot", "recording", "testing", "view"),
+    "cli": ("__init__",),
     "__main__": ("cli",),
 }
 

@@ -99,7 +99,7 @@ _NAMES_IN = {
 """The public names by module. `__init__.pyi` has the same as imports, for type checkers."""
 
 _HOMES = {name: module for module, names in _NAMES_IN.items() for name in names}
-_ROOMS = ("analysis", "data", "recording", "robot", "testing")
+_ROOMS = ("analysis", "data", "links", "plot", "recording", "robot", "testing", "view")
 
 __all__ = sorted(_HOMES)
 

@@ -2,9 +2,12 @@
 
 from tfbus import analysis as analysis
 from tfbus import data as data
+from tfbus import links as links
+from tfbus import plot as plot
 from tfbus import recording as recording
 from tfbus import robot as robot
 from tfbus import testing as testing
+from tfbus import view as view
 from tfbus.analysis.examiner import Finding as Finding
 from tfbus.analysis.examiner import diagnose as diagnose
 from tfbus.buffer.buffer import Buffer as Buffer

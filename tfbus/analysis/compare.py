@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -119,7 +119,7 @@ _Rows = npt.NDArray[np.float64]
 _Stamps = npt.NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Comparison:
     """The errors of a trajectory.
 
@@ -142,6 +142,22 @@ class Comparison:
     alignment: Alignment | None
     absolute: PoseErrors
     relative: PoseErrors
+
+    def __str__(self) -> str:
+        lines = [f"{self.poses:,} poses of {self.of[0]:,} and {self.of[1]:,}"]
+        lines[0] += ", not aligned" if self.alignment is None else f", aligned with scale {self.alignment.scale:g}"
+        lines.append(" " * 24 + "".join(f"{name:>10}" for name in Statistics.__match_args__))
+        for name, errors in (("absolute", self.absolute), ("relative", self.relative)):
+            found = errors.statistics() if len(errors.stamps) else ()
+            for part, values in zip(("translation [m]", "rotation [rad]"), found, strict=False):
+                lines.append(f"{name} {part:<15}" + "".join(f"{value:10.4g}" for value in astuple(values)))
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"<Comparison of {self.poses:,} poses>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{self}</pre>"
 
 
 def compare(

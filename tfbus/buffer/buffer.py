@@ -24,7 +24,7 @@ from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
 from tfbus.tree.lookup import Hold, Question, answer, policy_of, question_of
 from tfbus.tree.lookup_many import deskew, deskew_stamps
-from tfbus.tree.rendering import counted, describe, legend, to_html
+from tfbus.tree.rendering import cell, counted, describe, to_html
 from tfbus.tree.tree import TransformTree, forest_of, tree_of, window_of
 from tfbus.waiting.live_tree import LiveTree, PendingLookup
 from tfbus.which_kernel import plain_first
@@ -650,7 +650,7 @@ class Buffer:
 
     def _repr_html_(self) -> str:
         """The tree as notebooks show it, with ages counted from the clock's now."""
-        return to_html(self._edges(), self._clock.now()) + legend()
+        return cell(to_html(self._edges(), self._clock.now()))
 
     def _pending(self, most: int | None) -> Iterable[PendingLookup]:
         pending = self._lookups.pending(most)

@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager, suppress
 from itertools import chain
 from threading import get_ident
 from types import TracebackType
-from typing import Any
+from typing import Any, SupportsIndex
 from weakref import WeakSet
 
 import anyio
@@ -645,6 +645,9 @@ class Bus:
         # These run foreign code, so only after every waiter has been woken.
         for share in shares:
             share.call_end_callbacks()
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[Any, ...]:
+        raise TypeError("a bus belongs to its program and cannot be copied or pickled: use Buffer(bus).tree.copy()")
 
     def __enter__(self) -> Bus:
         return self

@@ -14,7 +14,7 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.errors import InvalidTransformError
+from tfbus.errors import InvalidTransformError, pip_install
 from tfbus.geometry.transform import Transform, from_row
 from tfbus.rows import NORM_TOLERANCE, ROUNDING, Columns, compose, invert, rotate
 from tfbus.stamps import StampsLike, as_array, as_stamps, format_stamp
@@ -237,7 +237,11 @@ class TransformArray:
         columns: dict[str, npt.NDArray[Any]] = {} if self._stamps is None else {"stamp_ns": self._stamps}
         columns |= zip(("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"), self._columns, strict=True)
         # Copies, because a data frame may be written to.
-        return import_module(library).DataFrame({name: column.copy() for name, column in columns.items()})
+        try:
+            frames = import_module(library)
+        except ImportError as error:
+            raise ImportError(f"a data frame needs one more package: {pip_install(library)} ({error})") from error
+        return frames.DataFrame({name: column.copy() for name, column in columns.items()})
 
     def matrices(self) -> Floats:
         """New homogeneous matrices of shape (n, 4, 4)."""

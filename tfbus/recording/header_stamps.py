@@ -13,7 +13,8 @@ from tfbus.recording.formats.copies import MessageTypes, types_with_header
 from tfbus.recording.formats.storage import Channel, UnfoldError
 from tfbus.recording.formats.transforms import decompressed
 from tfbus.recording.recording import open_storage
-from tfbus.stamps import SECOND
+from tfbus.stamps import SECOND, format_stamp
+from tfbus.tree.rendering import counted
 
 _HEADER_TYPES = ("Header", "std_msgs/Header", "std_msgs/msg/Header")
 
@@ -27,6 +28,14 @@ class HeaderStamps(NamedTuple):
     """Whether the stamps are from headers. If not, the messages have no header, and the stamps are their log times."""
     unreadable: int
     """The number of messages that are too short, and of damaged places of the file; both are left out."""
+
+    def __repr__(self) -> str:
+        origin = "headers" if self.from_headers else "log times"
+        span = (
+            f", {format_stamp(int(self.stamps[0]))} .. {format_stamp(int(self.stamps[-1]))}" if len(self.stamps) else ""
+        )
+        unreadable = f", {self.unreadable:,} unreadable" if self.unreadable else ""
+        return f"<HeaderStamps of {counted(len(self.stamps), 'message')}{span}, from {origin}{unreadable}>"
 
 
 def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:

@@ -46,7 +46,7 @@ from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge, FrameHistory, Outcome, SavedFrame, samples_of, save_frame
 from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, Hold, answer, bounds_of, policy_of
 from tfbus.tree.lookup_many import OutOfRange, deskew, lookup_many
-from tfbus.tree.rendering import counted, describe, legend, to_dot, to_html, to_yaml
+from tfbus.tree.rendering import cell, counted, describe, to_dot, to_html, to_yaml
 from tfbus.tree.twist import twist
 from tfbus.which_kernel import plain_first
 
@@ -694,7 +694,7 @@ class TransformTree:
     def _repr_html_(self) -> str:
         """The tree as notebooks show it, with ages counted from the newest stamp in it."""
         edges = self.edges()
-        return to_html(edges, max((edge.newest for edge in edges if edge.newest is not None), default=0)) + legend()
+        return cell(to_html(edges, max((edge.newest for edge in edges if edge.newest is not None), default=0)))
 
     def _check_writable(self, instead: str) -> None:
         if self._filled_by_bus:
