@@ -46,6 +46,14 @@ class BufferStatistics(Counts):
         joined, names another parent.
     looped : int
         Samples that formed a loop of parents at a past stamp, as late data can; they are counted above as well.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with Buffer(bus):
+    ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+    ...     print(bus.statistics().buffers)
+    (BufferStatistics(offered=1, inserted=1),)
     """
 
     offered: int
@@ -79,6 +87,14 @@ class QueueStatistics(Counts):
     conflated : int
         Samples that another sample of the same child replaced: moving ones in a queue with the overflow
         ``"conflate"``, static ones in a full recorder.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.stream(capacity=100):
+    ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+    ...     print(bus.statistics().queues)
+    (QueueStatistics(kind='stream', overflow='conflate', capacity=100, pending=1),)
     """
 
     kind: str
@@ -118,6 +134,13 @@ class BusStatistics(Counts):
         Accepted samples whose stamps were more than `max_ahead` ahead of the clock.
     behind : int
         Accepted samples whose stamps were more than `max_behind` behind the clock: see `StampBehind`.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> bus.publish(TransformStamped("map", "cart", 0, Transform()))
+    >>> bus.statistics()
+    BusStatistics(samples=1, frames=1)
     """
 
     samples: int

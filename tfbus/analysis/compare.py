@@ -23,6 +23,12 @@ class Alignment:
     ----------
     transform : Transform
     scale : float
+
+    Examples
+    --------
+    >>> from tfbus.analysis import Alignment
+    >>> Alignment(Transform((1.0, 0.0, 0.0)), scale=2.0).scale
+    2.0
     """
 
     transform: Transform
@@ -46,6 +52,14 @@ class Alignment:
         ------
         ValueError
             If the points do not determine a rotation, because all of them are on a line.
+
+        Examples
+        --------
+        >>> from tfbus.analysis import Alignment
+        >>> corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        >>> alignment = Alignment.between(corners, corners + (1.0, 0.0, 0.0), False)
+        >>> alignment.transform.is_close(Transform((1.0, 0.0, 0.0)))
+        True
         """
         mean, mean_reference = points.mean(axis=0), reference.mean(axis=0)
         centred = points - mean
@@ -85,6 +99,13 @@ class PoseErrors:
         m.
     rotation : float64 array of shape (n,)
         rad, from 0 to pi.
+
+    Examples
+    --------
+    >>> from tfbus.analysis import PoseErrors
+    >>> errors = PoseErrors(np.array([0, 1]), np.array([0.1, 0.3]), np.zeros(2))
+    >>> round(errors.statistics()[0].mean, 6)
+    0.2
     """
 
     stamps: npt.NDArray[np.int64]
@@ -98,6 +119,13 @@ class PoseErrors:
         ------
         ValueError
             If there are no errors, because there is only one pose.
+
+        Examples
+        --------
+        >>> from tfbus.analysis import PoseErrors
+        >>> translation, rotation = PoseErrors(np.array([0]), np.array([0.5]), np.array([0.0])).statistics()
+        >>> translation.rmse, rotation.max
+        (0.5, 0.0)
         """
         if not len(self.stamps):
             raise ValueError("there are no errors: a step needs two poses")
@@ -200,6 +228,21 @@ def compare(
     ValueError
         If there are no two poses at about the same stamp, the trajectories cannot be aligned, or `delta` is less than
         one, or `max_difference` negative.
+
+    Examples
+    --------
+    >>> from tfbus.analysis import compare
+    >>> wanted, found = TransformTree(), TransformTree()
+    >>> for stamp in range(3):
+    ...     _ = wanted.insert(TransformStamped("map", "cart", stamp, Transform((stamp, 0.0, 0.0))))
+    ...     _ = found.insert(TransformStamped("map", "cart", stamp, Transform((stamp, 0.5, 0.0))))
+    >>> print(compare(wanted, found, "map", "cart"))
+    3 poses of 3 and 3, not aligned
+                                  rmse      mean    median       std       min       max
+    absolute translation [m]       0.5       0.5       0.5         0       0.5       0.5
+    absolute rotation [rad]          0         0         0         0         0         0
+    relative translation [m]         0         0         0         0         0         0
+    relative rotation [rad]          0         0         0         0         0         0
     """
     if delta < 1:
         raise ValueError(f"delta must be at least 1, got {delta}")

@@ -256,6 +256,15 @@ class Buffer:
             At once, if a name cannot be the name of a frame: empty, or with a leading slash.
         TypeError
             If a stamp is a float, or `max_age` comes without a `LATEST`.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> bus = Bus(clock)
+        >>> with Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send("map", "cart", Transform((1.0, 2.0, 0.0)))
+        ...     print((await buffer.lookup("map", "cart", clock.now(), timeout=1.0)).transform.translation)
+        (1.0, 2.0, 0.0)
         """
         waits_plainly = max_age is None and source_at is None and fixed is None and not tolerance
         if self._feed is None or not waits_plainly or max_gap is not None or extrapolate is not None:
@@ -326,6 +335,14 @@ class Buffer:
             is given.
         TransformError
             As `lookup`.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> TransformBroadcaster(bus).send_static("base_link", "laser", Transform((0.1, 0.0, 0.2)))
+        >>> with Buffer(bus) as buffer:
+        ...     print(await buffer.transform(PointStamped("laser", 0, (1.0, 0.0, 0.0)), "base_link", timeout=1.0))
+        PointStamped(frame='base_link', stamp=0, point=(1.1, 0.0, 0.2))
         """
         question = question_of(data, target, as_at(at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
         if self._is_in_place(question):
@@ -424,6 +441,14 @@ class Buffer:
             As `lookup_nowait`, if there is no answer now.
         TypeError
             As `transform`.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> TransformBroadcaster(bus).send_static("base_link", "laser", Transform((0.1, 0.0, 0.2)))
+        >>> with Buffer(bus) as buffer:
+        ...     print(buffer.transform_nowait(PointStamped("laser", 0, (1.0, 0.0, 0.0)), "base_link").point)
+        (1.1, 0.0, 0.2)
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         if at is None and fixed is None and max_age is None and policy is None:
@@ -467,6 +492,12 @@ class Buffer:
         ------
         BusClosedError, ClockResetError, TypeError
             As `lookup`.
+
+        Examples
+        --------
+        >>> with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        ...     print(await buffer.can_transform_within("map", "cart", 0.0))
+        False
         """
         try:
             await self.lookup(
@@ -498,7 +529,18 @@ class Buffer:
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
     ) -> bool:
-        """Whether `lookup_nowait` with the same arguments has an answer now."""
+        """Whether `lookup_nowait` with the same arguments has an answer now.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send("map", "cart", Transform(), at=10)
+        ...     print([buffer.can_transform("map", "cart", stamp) for stamp in (10, 11)])
+        ...     print(buffer.can_transform("map", "cart", 11, tolerance=0.1))
+        [True, False]
+        True
+        """
         travels = source_at is not None or fixed is not None
         if not (travels or tolerance or max_age is not None or max_gap is not None or extrapolate is not None):
             known = self._paths.can_answer(target, source, at)
@@ -570,6 +612,16 @@ class Buffer:
         TypeError, ValueError
             If a threshold is negative or an angle of more than pi, a rate is not greater than zero, or something is not
             a number.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer, buffer.watch("map", "cart") as changes:
+        ...     TransformBroadcaster(bus).send("map", "cart", Transform((1.0, 0.0, 0.0)), at=10)
+        ...     async for transform in changes:
+        ...         print(transform)
+        ...         break
+        map <- cart at 0.00000001 s: Transform(translation=(1.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0, 1.0))
         """
         self.bus._check_thread()
         question = Question(target, source, LATEST, max_age=max_age, policy=policy_of(tolerance, max_gap, extrapolate))
@@ -595,6 +647,14 @@ class Buffer:
         """An explanation of the answer of `lookup_nowait`, or of everything that blocks it.
 
         See `TransformTree.explain`; ages are counted from the clock's now.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send("map", "cart", Transform(), at=0)
+        ...     print(buffer.explain("map", "cart", 0).answerable)
+        True
         """
         instant = as_at(at)
         asked = self._on_bus(Question(target, source, instant))
@@ -615,11 +675,29 @@ class Buffer:
         return found if self._local_names is None else self._local_names.explanation(found, target, source)
 
     def pending(self) -> tuple[PendingLookup, ...]:
-        """The lookups that wait now, and the watches without an answer, each with the error that blocks it."""
+        """The lookups that wait now, and the watches without an answer, each with the error that blocks it.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     print(list(buffer.pending()))
+        []
+        """
         return tuple(self._pending(None))
 
     def describe(self) -> str:
-        """The tree as text, with each edge's rate, age, span and authority, and some of the lookups that wait."""
+        """The tree as text, with each edge's rate, age, span and authority, and some of the lookups that wait.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send_static("map", "dock", Transform())
+        ...     print(buffer.describe())
+        map
+        └── dock  static
+        """
         lines = [describe(self._edges(), self._clock.now())]
         lines += [f"waiting: {lookup}" for lookup in self._pending(_DESCRIBED)]
         more = len(self._share.waiters) - _DESCRIBED
@@ -628,11 +706,28 @@ class Buffer:
         return "\n".join(lines)
 
     def on_close(self, callback: Callable[[], object]) -> Registration:
-        """Call `callback` once, on the event loop: when this buffer or its bus is closed, or now if one is."""
+        """Call `callback` once, on the event loop: when this buffer or its bus is closed, or now if one is.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     registration = buffer.on_close(lambda: print("no more samples come"))
+        ...     bus.close()
+        no more samples come
+        """
         return self._share.on_end(callback)
 
     def close(self) -> None:
-        """Leave the bus; waiting lookups end with `BusClosedError`. Buffered transforms can still be looked up."""
+        """Leave the bus; waiting lookups end with `BusClosedError`. Buffered transforms can still be looked up.
+
+        Examples
+        --------
+        >>> buffer = Buffer(Bus(SimulatedClock()))
+        >>> buffer.close()
+        >>> buffer
+        <Buffer of 0 frames, keeps 10 s, closed>
+        """
         if self.bus._detach(self._share):
             self._share.live.keep_for(self, self._tree)
         self._share.end("the buffer is closed")

@@ -29,6 +29,16 @@ class Watch:
     ----------
     skipped : int
         Number of batches that touched the watched path but appear in no answer, because a later batch had come.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with Buffer(bus) as buffer, buffer.watch("map", "cart") as changes:
+    ...     TransformBroadcaster(bus).send("map", "cart", Transform((1.0, 0.0, 0.0)), at=10)
+    ...     async for transform in changes:
+    ...         print(transform.stamp)
+    ...         changes.close()
+    10
     """
 
     def __init__(
@@ -71,7 +81,16 @@ class Watch:
         self._state.outdated = True
 
     def close(self) -> None:
-        """End the iteration; a second call does nothing."""
+        """End the iteration; a second call does nothing.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer, buffer.watch("map", "cart") as changes:
+        ...     changes.close()
+        ...     print([transform async for transform in changes])
+        []
+        """
         if self._state.waiting:
             self._check_thread()
         self._watching.remove(self._state)

@@ -289,6 +289,16 @@ class EventStream(OneReaderStream[Event]):
 
     The iteration ends when the bus or the stream is closed and all pending events have been read. The stream looks for
     stale frames while a task reads and nothing else is pending; their events are never dropped.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.events() as events:
+    ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+    ...     async for event in events:
+    ...         print(type(event).__name__)
+    ...         break
+    FrameAdded
     """
 
     def __init__(

@@ -184,6 +184,17 @@ class Stream(OneReaderStream[Batch]):
     """The result of `Bus.stream`: ``async for batch in stream``, for one reader.
 
     The iteration ends when the bus or the stream is closed and all pending batches have been read.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.stream(overflow="conflate") as batches:
+    ...     for stamp in range(3):
+    ...         bus.publish(TransformStamped("map", "cart", stamp, Transform()))
+    ...     async for batch in batches:
+    ...         print([sample.stamp for sample in batch])
+    ...         break
+    [2]
     """
 
     def __init__(

@@ -64,6 +64,11 @@ class TransformStamped(Sample):
         If a name is empty or starts with ``/``, child equals parent, or the stamp does not fit 64 bits.
     TypeError
         If an argument has the wrong type; a float stamp is the usual one.
+
+    Examples
+    --------
+    >>> TransformStamped("map", "cart", from_seconds(1.5), Transform((1.0, 2.0, 0.0)), authority="odometry").stamp
+    1500000000
     """
 
     __slots__ = ()
@@ -133,7 +138,13 @@ class TransformStamped(Sample):
         return None
 
     def replace(self, **changes: Unpack[Changes]) -> TransformStamped:
-        """A copy with some fields changed; all fields are checked again."""
+        """A copy with some fields changed; all fields are checked again.
+
+        Examples
+        --------
+        >>> TransformStamped("map", "cart", 0, Transform()).replace(child="trailer").child
+        'trailer'
+        """
         parent, child, stamp, row, authority, static = self._fields
         fields: Changes = {
             "parent": parent,
@@ -152,6 +163,11 @@ class TransformStamped(Sample):
         """Plain data for JSON: ``"type"``, and the parameters under their names; the stamp is an ``int`` of ns.
 
         With ``stamps="text"`` it is text, for programs in JavaScript, whose numbers are not exact beyond 2**53.
+
+        Examples
+        --------
+        >>> TransformStamped("map", "cart", 10, Transform()).to_dict(stamps="text")["stamp"]
+        '10'
         """
         parent, child, stamp, row, authority, static = self._fields
         values = {
@@ -178,6 +194,12 @@ class TransformStamped(Sample):
         ------
         ValueError
             If the data do not describe a `TransformStamped`. The message names the field.
+
+        Examples
+        --------
+        >>> sample = TransformStamped("map", "cart", 10, Transform())
+        >>> TransformStamped.from_dict(sample.to_dict()) == sample
+        True
         """
         kinds = _KINDS if "gap" not in data else {**_KINDS, **_POLICY_KINDS}
         fields = from_fields(TransformStamped, data, kinds)

@@ -92,12 +92,24 @@ class Transform:
 
     @classmethod
     def identity(cls) -> Transform:
-        """The transform that changes nothing."""
+        """The transform that changes nothing.
+
+        Examples
+        --------
+        >>> Transform.identity() @ Transform((1.0, 0.0, 0.0))
+        Transform(translation=(1.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0, 1.0))
+        """
         return from_row(IDENTITY)
 
     @classmethod
     def from_wxyz(cls, translation: Numbers, wxyz: Numbers) -> Transform:
-        """From a translation in m and a unit quaternion in transforms3d's order, (w, x, y, z)."""
+        """From a translation in m and a unit quaternion in transforms3d's order, (w, x, y, z).
+
+        Examples
+        --------
+        >>> Transform.from_wxyz((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)).rotation
+        (0.0, 0.0, 0.0, 1.0)
+        """
         w, x, y, z = as_floats(wxyz, 4, "rotation")
         return cls(translation, (x, y, z, w))
 
@@ -113,6 +125,11 @@ class Transform:
         InvalidTransformError
             If the shape is not (4, 4), a number is not finite, the last row is not (0, 0, 0, 1), or the rotation part
             is not a rotation.
+
+        Examples
+        --------
+        >>> Transform.from_matrix(np.eye(4)) == Transform.identity()
+        True
         """
         m = as_array(matrix, "matrix", np.float64)
         row = row_of_matrix(m)
@@ -165,7 +182,14 @@ class Transform:
 
     @classmethod
     def from_axis_angle(cls, axis: Numbers, angle: float, translation: Numbers = (0.0, 0.0, 0.0)) -> Transform:
-        """From a rotation by `angle` (rad) about `axis` (any length but zero), and a translation in m."""
+        """From a rotation by `angle` (rad) about `axis` (any length but zero), and a translation in m.
+
+        Examples
+        --------
+        >>> turn = Transform.from_axis_angle((0.0, 0.0, 1.0), np.pi / 2)
+        >>> turn.is_close(Transform.from_xyz_rpy((0.0, 0.0, 0.0), (0.0, 0.0, 90.0), degrees=True))
+        True
+        """
         from transforms3d.quaternions import axangle2quat
 
         x, y, z = as_floats(axis, 3, "axis")
@@ -183,7 +207,13 @@ class Transform:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Transform:
-        """The transform from which `to_dict` made `data`; `ValueError` if the data are not a transform."""
+        """The transform from which `to_dict` made `data`; `ValueError` if the data are not a transform.
+
+        Examples
+        --------
+        >>> Transform.from_dict({"translation": [1, 2, 3], "rotation": [0, 0, 0, 1]}).translation
+        (1.0, 2.0, 3.0)
+        """
         return cls(**from_fields(cls, data, _KINDS))
 
     @classmethod
@@ -206,7 +236,13 @@ class Transform:
         return self._row[3:]
 
     def as_wxyz(self) -> Quaternion:
-        """The rotation in transforms3d's order, (w, x, y, z)."""
+        """The rotation in transforms3d's order, (w, x, y, z).
+
+        Examples
+        --------
+        >>> Transform().as_wxyz()
+        (1.0, 0.0, 0.0, 0.0)
+        """
         return self._row[6], *self._row[3:6]
 
     def as_rpy(self) -> Vector:
@@ -215,6 +251,11 @@ class Transform:
         Sum and difference of roll and yaw are computed from the quaternion (Bernardes and Viollet, "Quaternion to
         Euler angles conversion", PLoS ONE 17(11), 2022): computed from a matrix, as in transforms3d, they are
         wrong by up to half a rad within 1e-8 rad of that pitch.
+
+        Examples
+        --------
+        >>> Transform().as_rpy()
+        (0.0, 0.0, 0.0)
         """
         x, y, z, w = self.rotation
         low, high = math.hypot(x + z, w - y), math.hypot(x - z, w + y)
@@ -231,6 +272,11 @@ class Transform:
         """Unit axis and angle in rad, from 0 to pi; the axis of no rotation is (1, 0, 0).
 
         The angle comes from ``atan2``: ``acos``, which transforms3d uses, loses half the digits near the identity.
+
+        Examples
+        --------
+        >>> Transform((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)).as_axis_angle()
+        ((0.0, 0.0, 1.0), 3.141592653589793)
         """
         x, y, z, w = self.rotation
         sine = math.hypot(x, y, z)
@@ -252,15 +298,33 @@ class Transform:
         return Rotation.from_quat(self.rotation)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON: ``"translation"`` [x, y, z] in m and ``"rotation"`` [x, y, z, w]."""
+        """Plain data for JSON: ``"translation"`` [x, y, z] in m and ``"rotation"`` [x, y, z, w].
+
+        Examples
+        --------
+        >>> Transform((1.0, 2.0, 3.0)).to_dict()
+        {'translation': [1.0, 2.0, 3.0], 'rotation': [0.0, 0.0, 0.0, 1.0]}
+        """
         return {"translation": list(self.translation), "rotation": list(self.rotation)}
 
     def matrix(self) -> npt.NDArray[np.float64]:
-        """A new homogeneous matrix of shape (4, 4)."""
+        """A new homogeneous matrix of shape (4, 4).
+
+        Examples
+        --------
+        >>> Transform((1.0, 2.0, 3.0)).matrix()[:3, 3]
+        array([1., 2., 3.])
+        """
         return fill_matrix(self._row, np.empty((4, 4)))
 
     def inverse(self) -> Transform:
-        """The transform that undoes this one."""
+        """The transform that undoes this one.
+
+        Examples
+        --------
+        >>> Transform((1.0, 2.0, 3.0)).inverse().translation
+        (-1.0, -2.0, -3.0)
+        """
         return from_row(invert_row(self._row))
 
     def __matmul__(self, other: Transform) -> Transform:
@@ -288,6 +352,12 @@ class Transform:
         ------
         ValueError
             If the shape does not end in 3. The message has the shape.
+
+        Examples
+        --------
+        >>> Transform((1.0, 0.0, 0.0)).apply(np.zeros((2, 3)))
+        array([[1., 0., 0.],
+               [1., 0., 0.]])
         """
         moved = move_point(self._row, points)
         if moved is not None:
@@ -318,6 +388,11 @@ class Transform:
         ------
         ValueError
             If `fraction` is not from 0 to 1: nothing here extrapolates by itself.
+
+        Examples
+        --------
+        >>> Transform().interpolate(Transform((1.0, 0.0, 0.0)), 0.25).translation
+        (0.25, 0.0, 0.0)
         """
         if not 0.0 <= fraction <= 1.0:
             raise ValueError(f"fraction must be from 0 to 1, got {fraction!r}")
@@ -334,6 +409,11 @@ class Transform:
             Greatest distance in m.
         rotation_tolerance : float
             Greatest angle between the rotations in rad.
+
+        Examples
+        --------
+        >>> Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)).is_close(Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, -1.0)))
+        True
         """
         if math.dist(self.translation, other.translation) > translation_tolerance:
             return False

@@ -182,11 +182,23 @@ class TransformArray:
         return None if self._policy_use is None else self._policy_use[1]
 
     def as_wxyz(self) -> Floats:
-        """The rotations in transforms3d's order, (w, x, y, z): a new array of shape (n, 4)."""
+        """The rotations in transforms3d's order, (w, x, y, z): a new array of shape (n, 4).
+
+        Examples
+        --------
+        >>> TransformArray([(1.0, 2.0, 3.0)], [(0.0, 0.0, 0.0, 1.0)]).as_wxyz()
+        array([[1., 0., 0., 0.]])
+        """
         return np.ascontiguousarray(self._columns[[6, 3, 4, 5]].T)
 
     def as_rpy(self) -> Floats:
-        """Roll, pitch, yaw of each in rad, as `Transform.as_rpy` gives them: a new array of shape (n, 3)."""
+        """Roll, pitch, yaw of each in rad, as `Transform.as_rpy` gives them: a new array of shape (n, 3).
+
+        Examples
+        --------
+        >>> TransformArray([(1.0, 2.0, 3.0)], [(0.0, 0.0, 0.0, 1.0)]).as_rpy()
+        array([[0., 0., 0.]])
+        """
         x, y, z, w = self._columns[3:]
         # Their squares add up to two, so at most one of them is near zero.
         low, high = np.hypot(x + z, w - y), np.hypot(x - z, w + y)
@@ -244,7 +256,13 @@ class TransformArray:
         return frames.DataFrame({name: column.copy() for name, column in columns.items()})
 
     def matrices(self) -> Floats:
-        """New homogeneous matrices of shape (n, 4, 4)."""
+        """New homogeneous matrices of shape (n, 4, 4).
+
+        Examples
+        --------
+        >>> TransformArray([(1.0, 2.0, 3.0)], [(0.0, 0.0, 0.0, 1.0)]).matrices().shape
+        (1, 4, 4)
+        """
         matrices = np.zeros((len(self), 4, 4))
         rotation = (*self._columns[3:],)
         for axis, unit in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
@@ -269,6 +287,13 @@ class TransformArray:
         ------
         ValueError
             If the shape is another. The message has the shape.
+
+        Examples
+        --------
+        >>> two = TransformArray([(1.0, 0.0, 0.0), (2.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 1.0)] * 2)
+        >>> two.apply(np.zeros((2, 3)))
+        array([[1., 0., 0.],
+               [2., 0., 0.]])
         """
         array = as_array(points, "points")
         if array.shape != (len(self), 3):
@@ -280,7 +305,13 @@ class TransformArray:
         return moved
 
     def inverse(self) -> TransformArray:
-        """The inverse of each transform at the same stamp, without `extrapolated_by` and `gap`."""
+        """The inverse of each transform at the same stamp, without `extrapolated_by` and `gap`.
+
+        Examples
+        --------
+        >>> TransformArray([(1.0, 2.0, 3.0)], [(0.0, 0.0, 0.0, 1.0)]).inverse().translations
+        array([[-1., -2., -3.]])
+        """
         return from_columns(np.stack(invert((*self._columns,))), stamps=self._stamps)
 
     def __matmul__(self, other: TransformArray | Transform) -> TransformArray:

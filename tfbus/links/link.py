@@ -267,7 +267,15 @@ class Link(AsyncOnly):
         return f"<{type(self).__name__} {self._end.name!r}: {state}>"
 
     def statistics(self) -> LinkStatistics:
-        """All counters, as they are now."""
+        """All counters, as they are now.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> async with LocalLink(Bus(), directory=tempfile.mkdtemp()) as link:
+        ...     print(link.statistics().peers)
+        0
+        """
         end = self._end
         return LinkStatistics(
             peers=len(end.present),

@@ -405,6 +405,19 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
     An error of the source, or of `frame` and `stamp`, is raised unchanged by the iteration, after the ready messages;
     if nobody reads on, by the end of the ``async with``, unless that is left by another exception. An exception that is
     no `Exception`, such as Ctrl-C, stops the body at once, and is raised unchanged by the ``async with``.
+
+    Examples
+    --------
+    >>> from collections.abc import AsyncIterator
+    >>> async def points() -> AsyncIterator[PointStamped]:
+    ...     yield PointStamped("laser", 0, (1.0, 0.0, 0.0))
+    >>> bus = Bus(SimulatedClock())
+    >>> TransformBroadcaster(bus).send_static("base_link", "laser", Transform((0.1, 0.0, 0.2)))
+    >>> with Buffer(bus) as buffer:
+    ...     async with MessageFilter(points(), buffer, target="base_link") as pairs:
+    ...         async for point, transform in pairs:
+    ...             print(point.frame, transform.parent)
+    laser base_link
     """
 
     @overload

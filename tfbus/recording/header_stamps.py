@@ -20,7 +20,14 @@ _HEADER_TYPES = ("Header", "std_msgs/Header", "std_msgs/msg/Header")
 
 
 class HeaderStamps(NamedTuple):
-    """The stamps of the messages on a topic."""
+    """The stamps of the messages on a topic.
+
+    Examples
+    --------
+    >>> from tfbus.recording import HeaderStamps
+    >>> HeaderStamps(np.array([0, SECOND]), from_headers=True, unreadable=0)
+    <HeaderStamps of 2 messages, 0.000 s .. 1.000 s, from headers>
+    """
 
     stamps: npt.NDArray[np.int64]
     """ns, in the order of the log times."""
@@ -51,6 +58,12 @@ def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
     ------
     RecordingError
         If the recording cannot be read, or nothing is on the topic.
+
+    Examples
+    --------
+    >>> from tfbus.recording import header_stamps
+    >>> header_stamps("small.bag", "/tf")
+    <HeaderStamps of 786 messages, 100.002 s .. 109.982 s, from log times>
     """
     name = topic.removeprefix("/")
     stamps: list[int] = []

@@ -205,6 +205,14 @@ class FrameSummary:
         The times between successive stamps.
     delay : Spread or None
         The times from the stamp of a moving sample to its log time; negative where stamps lie ahead.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording, summarise
+    >>> with open_recording("small.bag") as recording:
+    ...     frames = summarise(recording).frames
+    >>> frames[0].frame, frames[0].parents
+    ('arm', ('base_link',))
     """
 
     frame: str
@@ -245,6 +253,13 @@ class SenderSummary:
         The times between successive stamps of any of its moving samples; None for fewer than two stamps.
     delay : Spread or None
         As `FrameSummary.delay`.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording, summarise
+    >>> with open_recording("small.bag") as recording:
+    ...     print([sender.authority for sender in summarise(recording).senders])
+    ['arm', 'calibration', 'confused', 'description', 'odometry', 'perception', 'slam']
     """
 
     authority: str
@@ -282,6 +297,13 @@ class RecordingSummary:
         As `Recording.remarks`.
     details : tuple of str
         The losses at the first damaged places, in words.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording, summarise
+    >>> with open_recording("small.bag") as recording:
+    ...     print(summarise(recording).problems["not finite"])
+    3
     """
 
     path: Path
@@ -319,6 +341,14 @@ def summarise(
         The messages to read; by default, all messages of the recording, which is faster.
     progress : callable, optional
         Called with the number of messages in each block that has been read.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording, summarise
+    >>> with open_recording("small.bag") as recording:
+    ...     summary = summarise(recording)
+    >>> summary.transforms, summary.roots
+    (992, ('hen', 'island', 'map'))
     """
     counts = _Counts()
     blocks: Iterator[Block | DecodedBlock] = recording.blocks() if messages is None else iter([DecodedBlock(messages)])

@@ -109,7 +109,15 @@ _BLOCK = 64
 
 
 class Outcome(Enum):
-    """The effect of an insertion."""
+    """The effect of an insertion.
+
+    Examples
+    --------
+    >>> tree = TransformTree(keep=1.0)
+    >>> stamps = (from_seconds(5.0), from_seconds(5.0), 0)
+    >>> [tree.insert(TransformStamped("map", "cart", stamp, Transform())).name for stamp in stamps]
+    ['INSERTED', 'REPLACED', 'EXPIRED']
+    """
 
     INSERTED = "inserted"
     """A sample at a new stamp."""
@@ -121,7 +129,15 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """The newest edge of one frame; stamps in ns, None where there is no moving sample."""
+    """The newest edge of one frame; stamps in ns, None where there is no moving sample.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform()))
+    >>> tree.edges()[0].newest
+    10
+    """
 
     parent: str
     child: str

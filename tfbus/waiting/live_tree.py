@@ -144,7 +144,19 @@ _NEVER = 2**64
 
 @dataclass(frozen=True, slots=True)
 class PendingLookup:
-    """A waiting lookup: its question, when it began to wait (ns on the bus's clock), and the error that blocks it."""
+    """A waiting lookup: its question, when it began to wait (ns on the bus's clock), and the error that blocks it.
+
+    Examples
+    --------
+    >>> import anyio
+    >>> with Bus() as bus, Buffer(bus) as buffer:
+    ...     async with anyio.create_task_group() as tasks:
+    ...         _ = tasks.start_soon(buffer.lookup, "map", "cart")
+    ...         await anyio.wait_all_tasks_blocked()
+    ...         print(*buffer.pending())
+    ...         tasks.cancel_scope.cancel()
+    'cart' in 'map': frame 'map' is not known
+    """
 
     question: Question
     since: int
