@@ -1,6 +1,9 @@
 """The names of the package, and the package as a program."""
 
 import ast
+import copy
+import pickle
+import re
 import runpy
 import sys
 from dataclasses import FrozenInstanceError, fields, is_dataclass
@@ -8,6 +11,7 @@ from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.commands import Command
 
@@ -63,3 +67,35 @@ def test_the_package_runs_as_the_command(capsys: pytest.CaptureFixture[str], mon
         runpy.run_module("tfbus", run_name="__main__")
     assert ended.value.code == command.returncode == 2
     assert capsys.readouterr().err == command.stderr != ""
+
+
+def test_a_bus_says_why_it_cannot_be_copied_or_pickled() -> None:
+    for make in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match=r"use Buffer\(bus\).tree.copy\(\)"):
+            make(tfbus.Bus())
+
+
+def test_rooms_with_extras_are_found_after_a_plain_import() -> None:
+    for room, extra in (("plot", "matplotlib"), ("view", "viser"), ("links", "anyio")):
+        pytest.importorskip(extra)
+        assert getattr(tfbus, room) is import_module(f"tfbus.{room}")
+
+
+def test_long_values_print_in_few_lines_and_as_html() -> None:
+    trees = [tfbus.TransformTree(None), tfbus.TransformTree(None)]
+    for place in range(600):
+        for tree, off in zip(trees, (0.0, 0.5), strict=True):
+            tree.insert(tfbus.TransformStamped("map", "<cart>", place, tfbus.Transform((place, off, 0.0))))
+    comparison = tfbus.analysis.compare(trees[0], trees[1], "map", "<cart>")
+    assert len(str(comparison).splitlines()) < 8
+    assert re.search(r"absolute translation \[m\] +0.5 +0.5 +0.5 +0 +0.5 +0.5", str(comparison))
+    stamps = tfbus.recording.HeaderStamps(np.arange(600) * tfbus.SECOND, True, 2)
+    assert repr(stamps) == "<HeaderStamps of 600 messages, 0.000 s .. 599.000 s, from headers, 2 unreadable>"
+    explanation = trees[0].explain("map", "<cart>")
+    assert repr(explanation) == "<Explanation of '<cart>' in 'map', 1 edge: 0.000000599 s>"
+    assert "&lt;cart&gt;" in explanation._repr_html_()
+    bus = tfbus.Bus()
+    bus.publish(tfbus.TransformStamped("map", "cart", 1, tfbus.Transform()))
+    assert repr(bus.statistics()).startswith("BusStatistics(samples=1, frames=1")
+    assert "<tr><th>samples</th><td>1</td></tr>" in bus.statistics()._repr_html_()
+    assert "max-height" in trees[0]._repr_html_()

@@ -110,7 +110,20 @@ _NAMES_IN = {
 """The public names by module. `__init__.pyi` has the same as imports, for type checkers."""
 
 _HOMES = {name: module for module, names in _NAMES_IN.items() for name in names}
-_ROOMS = ("analysis", "axes", "camera", "data", "earth", "recording", "robot", "testing", "web")
+_ROOMS = (
+    "analysis",
+    "axes",
+    "camera",
+    "data",
+    "earth",
+    "links",
+    "plot",
+    "recording",
+    "robot",
+    "testing",
+    "view",
+    "web",
+)
 
 __all__ = sorted(_HOMES)
 

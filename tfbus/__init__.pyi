@@ -5,9 +5,12 @@ from tfbus import axes as axes
 from tfbus import camera as camera
 from tfbus import data as data
 from tfbus import earth as earth
+from tfbus import links as links
+from tfbus import plot as plot
 from tfbus import recording as recording
 from tfbus import robot as robot
 from tfbus import testing as testing
+from tfbus import view as view
 from tfbus import web as web
 from tfbus.analysis.examiner import Finding as Finding
 from tfbus.analysis.examiner import diagnose as diagnose

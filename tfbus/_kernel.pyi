@@ -1,204 +1,27 @@
-"""The compiled kernel. Its Python twin, `tfbus._python_kernel`, says what each class does.
+"""The compiled kernel for type checkers: the twins have the types of their definitions in Python, the rest has none."""
 
-`Feed`, `Intake` and `Method` have no twin: without the compiled kernel the ordinary way runs; see `tfbus.which_kernel`.
-"""
-
-from collections.abc import Callable, Mapping
 from typing import Any
 
-Vector = tuple[float, float, float]
-Row = tuple[float, float, float, float, float, float, float]
+from tfbus._python_kernel import Chain as Chain
+from tfbus._python_kernel import Edge as Edge
+from tfbus._python_kernel import History as History
+from tfbus._python_kernel import Judge as Judge
+from tfbus._python_kernel import Line as Line
+from tfbus._python_kernel import Parked as Parked
+from tfbus._python_kernel import Paths as Paths
+from tfbus._python_kernel import Sample as Sample
+from tfbus._python_kernel import columns as columns
+from tfbus._python_kernel import commit as commit
+from tfbus._python_kernel import compose_paths as compose_paths
+from tfbus._python_kernel import compose_rows as compose_rows
+from tfbus._python_kernel import decode as decode
+from tfbus._python_kernel import decode_whole as decode_whole
+from tfbus._python_kernel import fill_matrix as fill_matrix
+from tfbus._python_kernel import invert_row as invert_row
+from tfbus._python_kernel import move_point as move_point
+from tfbus._python_kernel import move_points as move_points
+from tfbus._python_kernel import row_of_matrix as row_of_matrix
 
-class Sample:
-    _fields: tuple[str, str, int, Row, str, bool]
-    @property
-    def _row(self) -> Row: ...
-    @property
-    def _square(self) -> float: ...
-    @property
-    def parent(self) -> str: ...
-    @property
-    def child(self) -> str: ...
-    @property
-    def stamp(self) -> int: ...
-    @property
-    def authority(self) -> str: ...
-    @property
-    def static(self) -> bool: ...
-
-class Columns:
-    def __len__(self) -> int: ...
-    def samples(self, kind: type[Any], /) -> tuple[Any, ...]: ...
-
-class Block: ...
-
-class History:
-    parent: str
-    authority: str
-    keep: int | None
-    mixed: bool
-    static_stamp: int | None
-    def __init__(self, parent: str, keep: int | None, /) -> None: ...
-    @property
-    def count(self) -> int: ...
-    @property
-    def oldest(self) -> int | None: ...
-    @property
-    def newest(self) -> int | None: ...
-    @property
-    def newest_record(self) -> bytes: ...
-    @property
-    def horizon(self) -> int: ...
-    def append(self, parent: str, stamp: int, row: Row, authority: str, /) -> bool: ...
-    def push(self, stamp: int, row: Row, /) -> None: ...
-    def push_many(self, stamps: Any, rows: Any, /) -> None: ...
-    def put(self, index: int, stamp: int, row: Row, /) -> None: ...
-    def find(self, stamp: int, /) -> int: ...
-    def between(self, low: int, high: int, /) -> tuple[int, int]: ...
-    def stamp(self, index: int, /) -> int: ...
-    def sample(self, index: int, /) -> tuple[int, Row]: ...
-    def row(self, at: int, /) -> Row | None: ...
-    def clear(self) -> None: ...
-    def take(self, other: History, /) -> None: ...
-    def columns(self, first: int, end: int, wanted: Any = None, /) -> tuple[Any, int, Any, int, int, int]: ...
-
-class Chain:
-    alone: bool
-    @property
-    def up(self) -> tuple[History | Row, ...]: ...
-    @property
-    def down(self) -> tuple[History | Row, ...]: ...
-    def __init__(
-        self, up: tuple[History | Row, ...], down: tuple[History | Row, ...], statics: tuple[History, ...], /
-    ) -> None: ...
-    def row(self, at: int, /) -> Row | None: ...
-    def latest(self) -> int | None: ...
-    def covers(self, at: int, /) -> bool: ...
-    def deciding(self, at: int, /) -> History | None: ...
-    def hold(self) -> Held | None: ...
-
-class Held:
-    def rows(self, stamps: Any, columns: Any, /) -> int | None: ...
-
-class Paths:
-    recent: dict[str, dict[str, Chain]]
-    inserted: int
-    now: Any
-    qualified: Any
-    version: int
-    def __init__(self, lock: Any, latest: object, kind: type[Sample], /) -> None: ...
-    def answer(self, target: str, source: str, at: object, /) -> Any: ...
-    def can_answer(self, target: str, source: str, at: object, /) -> bool | None: ...
-    def answer_many(self, target: str, source: str, stamps: Any, /) -> bytes | None: ...
-    def commit(self, frames: Mapping[str, History], readers: Mapping[int, Any], batch: Any, /) -> bool: ...
-
-class Edge:
-    parent: str
-    trusted: str | None
-    newest: int | None
-    late: bool
-
-class Judge:
-    behind: int
-    earliest: int
-    horizon: int
-    def __init__(self, edges: Mapping[str, Edge], square: float, /) -> None: ...
-    def accepts(self, batch: tuple[Sample, ...], /) -> bool: ...
-    def allow(self, earliest: int, horizon: int, lasting: int, /) -> None: ...
-
-class Parked:
-    answer: Any
-    asked: Any
-    cancel_end: Any
-    elsewhere: bool
-    limit: Any
-    names: tuple[str, ...] | None
-    patience: float
-    place: Any
-    share: Any
-    since: int
-    version: int
-    wake: Any
-    def __init__(self, asked: Any, since: int, wake: Any) -> None: ...
-    def __await__(self) -> Any: ...
-
-class Line:
-    @property
-    def places(self) -> list[Any]: ...
-    @property
-    def for_any(self) -> dict[Any, None]: ...
-    @property
-    def limits(self) -> list[Any]: ...
-
-class Feed:
-    begin: Any
-    call_after: Any
-    here: Any
-    kind: type[Parked]
-    loop: Any
-    share: Any
-    def __init__(
-        self,
-        paths: Paths,
-        frames: Mapping[str, History],
-        readers: Mapping[int, Any],
-        lines: Mapping[str, Line],
-        parked: Mapping[Any, None],
-        limits: list[Any],
-        watches: Mapping[str, Any],
-        index: Any,
-        /,
-    ) -> None: ...
-    def ask(self, target: str, source: str, at: Any, timeout: Any, /) -> Any: ...
-    def insert(self, batch: tuple[Sample, ...], /) -> bool: ...
-
-class Intake:
-    feeds: tuple[tuple[Any, Any], ...]
-    open: bool
-    samples: int
-    thread: int
-    def __init__(
-        self,
-        judge: Judge,
-        kind: type[Sample],
-        tell: Callable[[Any], object],
-        listeners: tuple[Any, ...],
-        busy: tuple[Any, ...],
-        /,
-    ) -> None: ...
-    def take(self, samples: object, invalid: object, /) -> bool | None: ...
-
-class Method:
-    __wrapped__: Any
-    def __init__(self, function: Any, many: type | None, /) -> None: ...
-    def __call__(self, *args: Any, **kwargs: Any) -> Any: ...
-
-def decode(
-    body: bytes, at: int, tags: tuple[tuple[str, bool], ...], names: Mapping[bytes, tuple[str, str]], kind: type[Any], /
-) -> tuple[list[Any], int]: ...
-def decode_whole(
-    tags: tuple[tuple[str, bool]],
-    names: Mapping[bytes, tuple[str, str]],
-    kind: type[Any],
-    most: int,
-    payload: bytes,
-    /,
-) -> tuple[Any, ...] | None: ...
-def columns(
-    parents: str | tuple[str, ...],
-    children: str | tuple[str, ...],
-    stamps: Any,
-    rows: Any,
-    authority: str,
-    static: bool,
-    square: float,
-    /,
-) -> Columns | None: ...
-def commit(frames: Mapping[str, History], batch: tuple[Sample, ...], first: int, /) -> int: ...
-def compose_paths(rows: Any, origins: Any, /) -> None: ...
-def compose_rows(a: Row, b: Row, /) -> Row: ...
-def invert_row(row: Row, /) -> Row: ...
-def move_point(row: Row, point: Any, /) -> Vector | None: ...
-def move_points(row: Row, points: Any, out: Any, /) -> bool: ...
-def fill_matrix(row: Row, out: Any, /) -> Any: ...
-def row_of_matrix(matrix: Any, /) -> Row | None: ...
+Feed: Any
+Intake: Any
+Method: Any

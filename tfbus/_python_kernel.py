@@ -113,9 +113,10 @@ class Judge:
     def __init__(self, edges: Mapping[str, Edge], square: float) -> None:
         self._edges = edges
         self._square = square
-        self.earliest = self.horizon = STAMP_MIN
+        self.earliest: int = STAMP_MIN
+        self.horizon: int = STAMP_MIN
         self._until = STAMP_MAX
-        self.behind = 0
+        self.behind: int = 0
 
     def allow(self, earliest: int, horizon: int, lasting: int, /) -> None:
         """Set `earliest` and `horizon` for `lasting` ns of the machine's time; after that, no batch is plain."""
@@ -383,13 +384,13 @@ class History:
     __slots__ = ("_cut_after", "_keep", "authority", "horizon", "mixed", "parent", "records", "stamps", "static_stamp")
 
     def __init__(self, parent: str, keep: int | None) -> None:
-        self.parent = parent
-        self.authority = ""
-        self.mixed = False
+        self.parent: str = parent
+        self.authority: str = ""
+        self.mixed: bool = False
         self.static_stamp: int | None = None
-        self.stamps = array("q")
-        self.records = bytearray()
-        self.horizon = STAMP_MIN
+        self.stamps: array[int] = array("q")
+        self.records: bytearray = bytearray()
+        self.horizon: int = STAMP_MIN
         self._keep = _FOREVER if keep is None else keep
         self._cut_after = STAMP_MIN
 
@@ -675,10 +676,10 @@ class Chain:
     __slots__ = ("_edges", "_statics", "alone", "down", "up")
 
     def __init__(self, up: tuple[Step, ...], down: tuple[Step, ...], statics: tuple[History, ...]) -> None:
-        self.up = up
-        self.down = down
+        self.up: tuple[Step, ...] = up
+        self.down: tuple[Step, ...] = down
         self._statics = statics
-        self.alone = False
+        self.alone: bool = False
         self._edges = tuple(step for step in (*up, *down) if isinstance(step, History))
 
     def row(self, at: int) -> Row | None:
@@ -760,7 +761,7 @@ class Paths:
         self._latest = latest
         self._kind = kind
         self.recent: dict[str, dict[str, Chain]] = {}
-        self.inserted = 0
+        self.inserted: int = 0
         self.now: Any = None
         self.qualified: Any = None
         self._changes = 0

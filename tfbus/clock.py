@@ -43,6 +43,13 @@ class Ticks:
     ----------
     skipped : int
         Number of skipped ticks.
+
+    Examples
+    --------
+    >>> clock = SimulatedClock()
+    >>> ticks = clock.ticks(hz=10.0)
+    >>> ticks.hz
+    10.0
     """
 
     def __init__(self, hz: float, elapsed: Callable[[], int], sleep_until: Callable[[int], Awaitable[None]]) -> None:
@@ -50,8 +57,8 @@ class Ticks:
             raise TypeError(f"a rate must be a number in Hz, not {hz!r}")
         if not (math.isfinite(hz) and hz > 0):
             raise ValueError(f"a rate must be greater than zero and finite, got {hz!r} Hz")
-        self.hz = float(hz)
-        self.skipped = 0
+        self.hz: float = float(hz)
+        self.skipped: int = 0
         self._elapsed = elapsed
         self._sleep_until = sleep_until
         self._start: int | None = None
@@ -80,6 +87,12 @@ class Clock(Protocol):
     `move_on_after` of its own ends each wait.
 
     A clock without a time at first may have a property ``is_set``. Until it is true, a bus compares no stamp with it.
+
+    Examples
+    --------
+    >>> clock: Clock = SimulatedClock(start=10)
+    >>> Bus(clock).clock.now()
+    10
     """
 
     def now(self) -> int:
@@ -102,18 +115,42 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """The time of the machine: stamps are ``time.time_ns()``, sleeps are monotonic. It never announces a jump."""
+    """The time of the machine: stamps are ``time.time_ns()``, sleeps are monotonic. It never announces a jump.
+
+    Examples
+    --------
+    >>> bus = Bus(SystemClock())
+    >>> bus.clock.now() > from_seconds(1.7e9)
+    True
+    """
 
     def now(self) -> int:
-        """Nanoseconds since 1970."""
+        """Nanoseconds since 1970.
+
+        Examples
+        --------
+        >>> SystemClock().now() > from_seconds(1.7e9)
+        True
+        """
         return time.time_ns()
 
     async def sleep(self, seconds: float) -> None:
-        """Sleep for a duration in s; zero passes a checkpoint."""
+        """Sleep for a duration in s; zero passes a checkpoint.
+
+        Examples
+        --------
+        >>> await SystemClock().sleep(0.001)
+        """
         await anyio.sleep(as_duration(seconds, "seconds"))
 
     async def sleep_until(self, stamp: int) -> None:
-        """Sleep until a stamp in ns, by its distance from now; later changes of the machine's clock have no effect."""
+        """Sleep until a stamp in ns, by its distance from now; later changes of the machine's clock have no effect.
+
+        Examples
+        --------
+        >>> clock = SystemClock()
+        >>> await clock.sleep_until(clock.now() + 1_000_000)
+        """
         await anyio.sleep(max(0, as_stamp(stamp) - self.now()) / SECOND)
 
     def ticks(self, hz: float) -> Ticks:
@@ -123,15 +160,36 @@ class SystemClock:
         ------
         ValueError
             If `hz` is not greater than zero and finite.
+
+        Examples
+        --------
+        >>> async for stamp in SystemClock().ticks(hz=1000.0):
+        ...     print(type(stamp).__name__)
+        ...     break
+        int
         """
         return Ticks(hz, self._elapsed, self._sleep_until_elapsed)
 
     def move_on_after(self, seconds: float) -> AbstractContextManager[anyio.CancelScope]:
-        """A ``with`` that cancels its body after a duration in s; see `anyio.move_on_after`."""
+        """A ``with`` that cancels its body after a duration in s; see `anyio.move_on_after`.
+
+        Examples
+        --------
+        >>> with SystemClock().move_on_after(0.001) as scope:
+        ...     await SystemClock().sleep(60.0)
+        >>> scope.cancelled_caught
+        True
+        """
         return anyio.move_on_after(as_duration(seconds, "seconds"))
 
     def on_jump(self, callback: JumpCallback) -> Registration:  # noqa: ARG002 - the protocol's signature
-        """Return a registration that never calls `callback`."""
+        """Return a registration that never calls `callback`.
+
+        Examples
+        --------
+        >>> with SystemClock().on_jump(print):
+        ...     pass  # The system's clock never says that it jumped.
+        """
         return Registration(lambda: None)
 
     def _elapsed(self) -> int:
@@ -166,6 +224,13 @@ class SimulatedClock:
             tasks.start_soon(robot, Bus(clock))
             await clock.advance(10.0)
             tasks.cancel_scope.cancel()
+
+    Examples
+    --------
+    >>> clock = SimulatedClock()
+    >>> await clock.advance(1.5)
+    >>> clock.now()
+    1500000000
     """
 
     def __init__(self, start: int = 0) -> None:
@@ -184,7 +249,13 @@ class SimulatedClock:
         return f"<SimulatedClock at {format_stamp(self._now)}, {timers:,} timer{'' if timers == 1 else 's'}>"
 
     def now(self) -> int:
-        """The current simulated stamp, in ns."""
+        """The current simulated stamp, in ns.
+
+        Examples
+        --------
+        >>> SimulatedClock(start=from_seconds(2.0)).now()
+        2000000000
+        """
         return self._now
 
     @property
@@ -193,7 +264,17 @@ class SimulatedClock:
         return self._is_set
 
     async def sleep(self, seconds: float) -> None:
-        """Sleep for a simulated duration in s; zero passes a checkpoint."""
+        """Sleep for a simulated duration in s; zero passes a checkpoint.
+
+        Examples
+        --------
+        >>> import anyio
+        >>> async def nap(clock: SimulatedClock) -> None:
+        ...     async with anyio.create_task_group() as tasks:
+        ...         tasks.start_soon(clock.sleep, 60.0)
+        ...         await clock.advance(60.0)
+        >>> await nap(SimulatedClock())
+        """
         duration = as_duration(seconds, "seconds")
         if duration * SECOND >= STAMP_MAX:
             await anyio.sleep_forever()
@@ -206,6 +287,10 @@ class SimulatedClock:
         ------
         ClockResetError
             If the clock jumps back before that.
+
+        Examples
+        --------
+        >>> await SimulatedClock(start=10).sleep_until(5)
         """
         sleeper = _StampSleeper(as_stamp(stamp), anyio.Event())
         if sleeper.stamp <= self._now:
@@ -229,12 +314,29 @@ class SimulatedClock:
         ------
         ValueError
             If `hz` is not greater than zero and finite.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> async for stamp in clock.ticks(hz=10.0):
+        ...     print(stamp)
+        ...     break
+        0
         """
         return Ticks(hz, lambda: self._elapsed, self._sleep_until_elapsed)
 
     @contextmanager
     def move_on_after(self, seconds: float) -> Iterator[anyio.CancelScope]:
-        """A ``with`` that cancels its body after a simulated duration in s; see `anyio.move_on_after`."""
+        """A ``with`` that cancels its body after a simulated duration in s; see `anyio.move_on_after`.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> with clock.move_on_after(5.0) as scope:
+        ...     await clock.advance(1.0)
+        >>> scope.cancelled_caught
+        False
+        """
         duration = as_duration(seconds, "seconds")
         with anyio.CancelScope() as scope:
             if duration * SECOND >= STAMP_MAX:
@@ -253,6 +355,13 @@ class SimulatedClock:
 
         The timeouts of waiting lookups are such calls. `advance` makes the call between two runs of the tasks; it
         raises the errors of the call.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> with clock.call_after(5.0, lambda: print("five seconds later")):
+        ...     await clock.advance(5.0)
+        five seconds later
         """
         duration = as_duration(seconds, "seconds")
         if duration * SECOND >= STAMP_MAX:
@@ -261,13 +370,29 @@ class SimulatedClock:
         return Registration(lambda: self._stop_timer(timer))
 
     def on_jump(self, callback: JumpCallback) -> Registration:
-        """Call `callback` with the stamps before and after each `set`."""
+        """Call `callback` with the stamps before and after each `set`.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock(start=10)
+        >>> with clock.on_jump(print):
+        ...     clock.set(0)
+        10 0
+        """
         key = next(self._order)
         self._callbacks[key] = callback
         return Registration(lambda: self._callbacks.pop(key, None))
 
     def on_move(self, callback: Callable[[int], object]) -> Registration:
-        """Call `callback` with each new stamp, after every step of `advance` and after `set`."""
+        """Call `callback` with each new stamp, after every step of `advance` and after `set`.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> with clock.on_move(print):
+        ...     await clock.advance(1.0)
+        1000000000
+        """
         key = next(self._order)
         self._listeners[key] = callback
         return Registration(lambda: self._listeners.pop(key, None))
@@ -285,6 +410,13 @@ class SimulatedClock:
             If `seconds` is negative.
         RuntimeError
             If another task is advancing the clock.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> await clock.advance(0.5)
+        >>> clock.now()
+        500000000
         """
         duration = from_seconds(as_duration(seconds, "seconds"))
         if self._advancing:
@@ -308,6 +440,13 @@ class SimulatedClock:
 
         Sleeps of a duration are not changed. `sleep_until` ends if the stamp is reached, and raises `ClockResetError`
         after a jump back.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> clock.set(100)
+        >>> clock.now()
+        100
         """
         before, after = self._now, as_stamp(stamp)
         self._now, self._is_set = after, True

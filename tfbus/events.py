@@ -14,7 +14,16 @@ from tfbus.stamps import format_duration, format_stamp, likely_cause
 
 @dataclass(frozen=True, slots=True)
 class FrameAdded(PlainData):
-    """A frame has a parent, because its first sample arrived or because it had one when the event stream was opened."""
+    """A frame has a parent, because its first sample arrived or because it had one when the event stream was opened.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.events() as events:
+    ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+    ...     print(await anext(aiter(events)))
+    0.000 s: moving frame 'cart' is new under 'map', from ''
+    """
 
     stamp: int
     frame: str
@@ -29,7 +38,19 @@ class FrameAdded(PlainData):
 
 @dataclass(frozen=True, slots=True)
 class FrameRemoved(PlainData):
-    """A frame was removed: the bus and its buffers have forgotten its parent and its samples."""
+    """A frame was removed: the bus and its buffers have forgotten its parent and its samples.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> bus.publish(TransformStamped("map", "cart", 0, Transform()))
+    >>> with bus.events() as events:
+    ...     bus.remove_frame("cart")
+    ...     arrived = aiter(events)
+    ...     _ = await anext(arrived)
+    ...     print(await anext(arrived))
+    0.000 s: frame 'cart' was removed
+    """
 
     stamp: int
     frame: str
@@ -275,6 +296,14 @@ class ClockReset(PlainData):
     """The clock jumped back from `before` to `stamp` (ns), and the bus forgot every moving frame.
 
     With ``on_conflict="reject"`` each of these frames stays with its first authority until it is removed.
+
+    Examples
+    --------
+    >>> bus = Bus(clock := SimulatedClock(start=from_seconds(5.0)))
+    >>> with bus.events() as events:
+    ...     clock.set(0)
+    ...     print(await anext(aiter(events)))
+    0.000 s: the clock jumped back from 5.000 s
     """
 
     stamp: int

@@ -48,7 +48,7 @@ class Prefix:
         if isinstance(shared, str):
             raise TypeError(f"shared must be a set of frame names, not the one name {shared!r}")
         self.prefix = prefix
-        self.shared = frozenset(shared)
+        self.shared: frozenset[str] = frozenset(shared)
         for name in (prefix, *self.shared):
             if not is_frame(name):
                 raise ValueError(f"a prefix or shared name must not be empty or start with '/', got {name!r}")

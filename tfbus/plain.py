@@ -6,17 +6,21 @@ the JSON of protobuf. An array becomes a dict of its dtype, its shape, and its v
 """
 
 import math
+import re
 import types
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import cache
-from typing import Any, Self, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Self, TypeAlias, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from tfbus.stamps import LATEST, Latest
 
 _NOT_FINITE = ("NaN", "Infinity", "-Infinity")
+_INTEGER = re.compile("-?[0-9]{1,20}")
+StampsAs: TypeAlias = Literal["int", "text"]
+"""Stamps as numbers, or as text: the numbers of JavaScript are exact up to 2**53, and a stamp of today is larger."""
 _PLAIN = frozenset((types.NoneType, bool, int, str))
 
 
@@ -37,13 +41,17 @@ class PlainData:
 
     __slots__ = ()
 
-    def to_dict(self) -> dict[str, Any]:
-        """The fields as plain data for JSON, with the name of the class as ``"type"``; stamps are ``int`` of ns."""
+    def to_dict(self, *, stamps: StampsAs = "int") -> dict[str, Any]:
+        """The fields as plain data for JSON, with the name of the class as ``"type"``; stamps are ``int`` of ns.
+
+        With ``stamps="text"``, the fields `stamp` and `stamps` are text, for programs in JavaScript, whose numbers are
+        not exact beyond 2**53. `from_dict` reads both.
+        """
         values: dict[str, Any] = {"type": type(self).__name__}
         for name in _kinds_of_fields(type(self)):  # type: ignore[arg-type]
             value = getattr(self, name)
             values[name] = value if type(value) in _PLAIN else to_plain(value)
-        return values
+        return values if stamps == "int" else with_text(values, stamps)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -55,6 +63,60 @@ class PlainData:
             If a field is missing, unknown or of another kind, or the class refuses its value. The message names it.
         """
         return cls(**from_fields(cls, data, _kinds_of_fields(cls)))  # type: ignore[arg-type]
+
+
+def with_text(values: dict[str, Any], stamps: str) -> dict[str, Any]:
+    """Plain data with text as `stamp` and `stamps`.
+
+    Raises
+    ------
+    ValueError
+        If `stamps` is not ``"text"``.
+    """
+    if stamps != "text":
+        raise ValueError(f"stamps must be 'int' or 'text', not {stamps!r}")
+    if values.get("stamp") is not None:
+        values["stamp"] = str(values["stamp"])
+    if isinstance(values.get("stamps"), dict):
+        values["stamps"]["values"] = [str(stamp) for stamp in values["stamps"]["values"]]
+    return values
+
+
+def schema_of(kind: Any, kinds: Mapping[str, Any], defaults: Mapping[str, Any], handler: Any) -> Any:
+    """The schema by which pydantic reads and writes a class that has `to_dict` and `from_dict`.
+
+    Parameters
+    ----------
+    kind : type
+    kinds : mapping of str to type
+        The type of each field.
+    defaults : mapping
+        The values of fields that may be missing; a field that is None here is passed on only if it is given.
+    handler : pydantic.GetCoreSchemaHandler
+    """
+    from pydantic_core import core_schema
+
+    def validate(value: Any, read: Callable[[Any], Any]) -> Any:
+        if isinstance(value, kind):
+            return value
+        given = {**defaults, **read(value)}
+        return kind.from_dict({name: part for name, part in given.items() if part is not None})
+
+    def write(value: Any) -> dict[str, Any]:
+        # The values behind the keys of `to_dict`: the schema has a way of its own to write each of them.
+        return {name: getattr(value, name, part) for name, part in value.to_dict().items()}
+
+    fields = {
+        name: core_schema.typed_dict_field(handler.generate_schema(hint), required=name not in defaults)
+        for name, hint in {"type": Literal[kind.__name__], **kinds}.items()
+    }
+    plain = core_schema.typed_dict_schema(fields, cls_name=kind.__name__, extra_behavior="forbid")
+    return core_schema.no_info_wrap_validator_function(
+        validate,
+        plain,
+        ref=f"{kind.__module__}.{kind.__qualname__}",
+        serialization=core_schema.plain_serializer_function_ser_schema(write, return_schema=plain),
+    )
 
 
 def to_plain(value: Any) -> Any:
@@ -147,7 +209,7 @@ def from_plain(hint: Any, value: Any, name: str) -> Any:
 def _exact(hint: Any) -> frozenset[Any]:
     """The types of values that are their own plain data and cannot be read as another alternative of a type."""
     readers = dict(_readers_of(hint))
-    exact = {kind for kind, read in readers.items() if read is _read_exact}
+    exact = {kind for kind, read in readers.items() if read in (_read_exact, _read_int)}
     if len(exact) < len(readers):
         # Some texts are numbers that are not finite, or `LATEST`.
         exact.discard(str)
@@ -177,6 +239,12 @@ _OTHER = object()
 
 def _read_exact(kind: type, value: Any, _name: str) -> Any:
     return value if type(value) is kind else _OTHER
+
+
+def _read_int(kind: type, value: Any, name: str) -> Any:
+    if isinstance(value, str) and name.endswith((".stamp", ".stamps")) and _INTEGER.fullmatch(value):
+        return int(value)
+    return _read_exact(kind, value, name)
 
 
 def _read_dict(kind: Any, value: Any, _name: str) -> Any:
@@ -224,6 +292,8 @@ def _read_array(_kind: Any, value: Any, name: str) -> Any:
         if dtype.kind not in "biuf":
             return _OTHER
         values = value["values"]
+        if dtype.kind in "iu":
+            values = [_read_int(int, part, name) for part in values]
         # numpy would cut off fractions, and read numbers in any text.
         wanted = {"b": (bool,), "f": (int, float)}.get(dtype.kind, (int,))
         if not all(type(part) in wanted or (dtype.kind == "f" and part in _NOT_FINITE) for part in values):
@@ -243,7 +313,7 @@ def _read_error(_kind: Any, value: Any, _name: str) -> Any:
 _READERS: dict[Any, Any] = {
     types.NoneType: _read_exact,
     bool: _read_exact,
-    int: _read_exact,
+    int: _read_int,
     str: _read_exact,
     float: _read_float,
     Latest: _read_latest,

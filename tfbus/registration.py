@@ -15,6 +15,15 @@ class Registration:
     ----------
     undo : callable
         Ends the registration; called once.
+
+    Examples
+    --------
+    >>> bus, seen = Bus(SimulatedClock()), []
+    >>> with bus.subscribe(seen.append):
+    ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+    >>> bus.publish(TransformStamped("map", "cart", 1, Transform()))
+    >>> len(seen)
+    1
     """
 
     __slots__ = ("_undo",)
@@ -23,7 +32,17 @@ class Registration:
         self._undo: Callable[[], object] | None = undo
 
     def close(self) -> None:
-        """End the registration; a second call does nothing."""
+        """End the registration; a second call does nothing.
+
+        Examples
+        --------
+        >>> bus, seen = Bus(SimulatedClock()), []
+        >>> registration = bus.subscribe(seen.append)
+        >>> registration.close()
+        >>> bus.publish(TransformStamped("map", "cart", 1, Transform()))
+        >>> seen
+        []
+        """
         undo, self._undo = self._undo, None
         if undo is not None:
             undo()

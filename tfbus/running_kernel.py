@@ -54,5 +54,5 @@ def _warn_of_shadowed_kernel() -> None:
         )
 
 
-running_kernel = _choose(os.environ.get("TFBUS_KERNEL"))
+running_kernel: str = _choose(os.environ.get("TFBUS_KERNEL"))
 """``"compiled"`` or ``"python"``."""

@@ -50,7 +50,15 @@ _PARTS = {"ps": 1_000, "fs": 1_000_000, "as": SECOND}
 
 
 class Latest(Enum):
-    """The type of `LATEST`."""
+    """The type of `LATEST`.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform()))
+    >>> tree.lookup("map", "cart", LATEST).stamp
+    10
+    """
 
     LATEST = "LATEST"
 
@@ -106,7 +114,13 @@ def from_seconds(seconds: float, nanoseconds: SupportsIndex = 0) -> int:
 
 
 def to_seconds(stamp: int) -> float:
-    """Seconds in a number of nanoseconds, as the nearest float (not exact for today's stamps)."""
+    """Seconds in a number of nanoseconds, as the nearest float (not exact for today's stamps).
+
+    Examples
+    --------
+    >>> to_seconds(12_500_000_000)
+    12.5
+    """
     return stamp / SECOND
 
 
@@ -292,7 +306,13 @@ def format_seconds(nanoseconds: int) -> str:
 
 
 def format_stamp(stamp: int) -> str:
-    """The exact text of a stamp, in seconds: ``12.500 s``, ``12.500000001 s``."""
+    """The exact text of a stamp, in seconds: ``12.500 s``, ``12.500000001 s``.
+
+    Examples
+    --------
+    >>> format_stamp(from_seconds(12.5))
+    '12.500 s'
+    """
     sign = "-" if stamp < 0 else ""
     whole, rest = divmod(abs(stamp), SECOND)
     digits = f"{rest:09d}"

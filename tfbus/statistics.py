@@ -1,13 +1,32 @@
 """Statistics as frozen dataclasses; ``dataclasses.asdict`` gives data for JSON."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from html import escape
+from typing import Any
 
 from tfbus.plain import PlainData
 
 
-@dataclass(frozen=True, slots=True)
-class BufferStatistics(PlainData):
+class Counts(PlainData):
+    """A base of statistics, which print only the fields that are not zero or empty."""
+
+    __slots__ = ()
+
+    def _counted(self) -> dict[str, Any]:
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        return {name: value for name, value in values.items() if value}
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in self._counted().items())})"
+
+    def _repr_html_(self) -> str:
+        cells = (f"<tr><th>{name}</th><td>{escape(str(value))}</td></tr>" for name, value in self._counted().items())
+        return f"<table><caption>{type(self).__name__}</caption>{''.join(cells)}</table>"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class BufferStatistics(Counts):
     """The samples of one buffer since it was attached, and its waiting lookups.
 
     ``offered == inserted + replaced + expired``
@@ -27,6 +46,14 @@ class BufferStatistics(PlainData):
         joined, names another parent.
     looped : int
         Samples that formed a loop of parents at a past stamp, as late data can; they are counted above as well.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with Buffer(bus):
+    ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+    ...     print(bus.statistics().buffers)
+    (BufferStatistics(offered=1, inserted=1),)
     """
 
     offered: int
@@ -39,8 +66,8 @@ class BufferStatistics(PlainData):
     looped: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class QueueStatistics(PlainData):
+@dataclass(frozen=True, slots=True, repr=False)
+class QueueStatistics(Counts):
     """One bounded queue: of a stream, of events, or of samples from other threads.
 
     Every moving sample that was put into the queue was read, or is counted as pending, dropped or conflated.
@@ -60,6 +87,14 @@ class QueueStatistics(PlainData):
     conflated : int
         Samples that another sample of the same child replaced: moving ones in a queue with the overflow
         ``"conflate"``, static ones in a full recorder.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.stream(capacity=100):
+    ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+    ...     print(bus.statistics().queues)
+    (QueueStatistics(kind='stream', overflow='conflate', capacity=100, pending=1),)
     """
 
     kind: str
@@ -70,8 +105,8 @@ class QueueStatistics(PlainData):
     conflated: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class BusStatistics(PlainData):
+@dataclass(frozen=True, slots=True, repr=False)
+class BusStatistics(Counts):
     """One bus since it was made.
 
     Attributes
@@ -99,6 +134,13 @@ class BusStatistics(PlainData):
         Accepted samples whose stamps were more than `max_ahead` ahead of the clock.
     behind : int
         Accepted samples whose stamps were more than `max_behind` behind the clock: see `StampBehind`.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> bus.publish(TransformStamped("map", "cart", 0, Transform()))
+    >>> bus.statistics()
+    BusStatistics(samples=1, frames=1)
     """
 
     samples: int
@@ -115,8 +157,8 @@ class BusStatistics(PlainData):
     behind: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class LinkStatistics(PlainData):
+@dataclass(frozen=True, slots=True, repr=False)
+class LinkStatistics(Counts):
     """One link since it was entered.
 
     Attributes
@@ -153,8 +195,8 @@ class LinkStatistics(PlainData):
     queue: QueueStatistics
 
 
-@dataclass(frozen=True, slots=True)
-class BufferServerStatistics(PlainData):
+@dataclass(frozen=True, slots=True, repr=False)
+class BufferServerStatistics(Counts):
     """One buffer server since it was entered.
 
     Attributes
@@ -177,8 +219,8 @@ class BufferServerStatistics(PlainData):
     refused: Mapping[str, int]
 
 
-@dataclass(frozen=True, slots=True)
-class RecorderStatistics(PlainData):
+@dataclass(frozen=True, slots=True, repr=False)
+class RecorderStatistics(Counts):
     """One recorder since it was entered.
 
     The number of samples that the bus gave to it is
@@ -204,8 +246,8 @@ class RecorderStatistics(PlainData):
     queue: QueueStatistics
 
 
-@dataclass(frozen=True, slots=True)
-class RobotStatistics(PlainData):
+@dataclass(frozen=True, slots=True, repr=False)
+class RobotStatistics(Counts):
     """One robot state publisher since it was made.
 
     Attributes

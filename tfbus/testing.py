@@ -32,6 +32,16 @@ async def simulate(clock: SimulatedClock, function: Callable[[], Awaitable[T]], 
     ------
     TimeoutError
         If the function has not ended after `limit`, usually because it waits for data that are never sent.
+
+    Examples
+    --------
+    >>> from tfbus.testing import simulate
+    >>> clock = SimulatedClock()
+    >>> async def hour() -> int:
+    ...     await clock.sleep(3600.0)
+    ...     return clock.now()
+    >>> await simulate(clock, hour, limit=7200.0)
+    3600000000000
     """
     result: list[T] = []
     error: list[Exception] = []
@@ -71,6 +81,11 @@ def assert_close(
         Greatest distance in m.
     rotation_tolerance : float
         Greatest angle in rad.
+
+    Examples
+    --------
+    >>> from tfbus.testing import assert_close
+    >>> assert_close(Transform((1.0, 0.0, 0.0)), Transform((1.0 + 1e-12, 0.0, 0.0)))
     """
     left = actual.transform if isinstance(actual, TransformStamped) else actual
     right = expected.transform if isinstance(expected, TransformStamped) else expected

@@ -46,7 +46,7 @@ if kernel == "python":
     Feed: Any = None
     Intake: Any = None
 else:
-    from tfbus._kernel import (  # type: ignore[assignment]
+    from tfbus._kernel import (
         Chain,
         Edge,
         Feed,

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from support.strategies import samples
 
+import tfbus
 from tfbus import LATEST, InvalidTransformError, Transform, TransformStamped
 from tfbus.geometry.stamped import (
     GREATEST_BOUND,
@@ -98,9 +99,9 @@ def test_replaced_fields_are_checked_again() -> None:
     with pytest.raises(InvalidTransformError, match="own parent"):
         sample.replace(parent="base_link")
     with pytest.raises(TypeError, match="from_seconds"):
-        sample.replace(stamp=7.0)
+        sample.replace(stamp=7.0)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="colour"):
-        sample.replace(colour="red")
+        sample.replace(colour="red")  # type: ignore[call-arg]
 
 
 @given(samples())
@@ -210,3 +211,73 @@ def test_transforms_that_do_not_meet_in_frame_and_time_are_not_composed(parent: 
         moving @ TransformStamped(parent, "laser", stamp, Transform())
     with pytest.raises(TypeError):
         moving @ Transform()  # type: ignore[operator]
+
+
+TODAY = 1_764_300_000_123_456_789
+
+
+def test_a_browser_gives_a_stamp_back_exactly_if_it_came_as_text() -> None:
+    sample = TransformStamped("map", "cart", TODAY, Transform((1.0, 2.0, 3.0)), "odometry")
+    cloud = tfbus.PointCloud("map", TODAY, np.ones((1, 3)), np.array([TODAY - 1]))
+    for data in (sample, cloud, tfbus.PointStamped("map", TODAY, (1.0, 2.0, 3.0))):
+        # JavaScript reads every number as a float, and writes whole ones without a point.
+        text = json.loads(json.dumps(data.to_dict(stamps="text")), parse_int=lambda digits: int(float(digits)))
+        assert (text["stamp"], type(data).from_dict(text).stamp) == (str(TODAY), TODAY)
+        with pytest.raises(ValueError, match="'int' or 'text'"):
+            data.to_dict(stamps="float")  # type: ignore[arg-type]
+    read = tfbus.PointCloud.from_dict(json.loads(json.dumps(cloud.to_dict(stamps="text"))))
+    assert read.stamps is not None and read.stamps.tolist() == [TODAY - 1]
+    for wrong in ("1.5", " 1", "1_0", "", "9" * 5000):
+        with pytest.raises(ValueError, match="stamp"):
+            TransformStamped.from_dict({**sample.to_dict(), "stamp": wrong})
+
+
+def test_the_fields_of_a_sample_can_be_matched_and_replaced() -> None:
+    sample = TransformStamped("map", "cart", 1, Transform((1.0, 2.0, 3.0)), "odometry")
+    match sample:
+        case TransformStamped("map", child, _, Transform((x, _, _), rotation), "odometry", False):
+            assert (child, x, rotation) == ("cart", 1.0, (0.0, 0.0, 0.0, 1.0))
+        case _:
+            pytest.fail("no match")
+    moved = sample.transform.__replace__(translation=(0.0, 0.0, 1.0))
+    assert moved == Transform((0.0, 0.0, 1.0)) and sample.__replace__(transform=moved) == sample.replace(
+        transform=moved
+    )
+    with pytest.raises(InvalidTransformError):
+        sample.__replace__(child="map")
+
+
+def test_pydantic_reads_and_writes_a_sample_as_its_dict_and_answers_too() -> None:
+    pydantic = pytest.importorskip("pydantic")
+    tree = tfbus.TransformTree()
+    tree.insert_many([TransformStamped("map", "cart", TODAY + ns, Transform((ns, 0.0, 0.0)), "odo") for ns in (0, 10)])
+    adapter = pydantic.TypeAdapter(TransformStamped)
+    answers = [
+        tree.lookup("map", "cart"),
+        tree.lookup("map", "cart", TODAY + 5, max_gap=1.0),
+        tree.lookup("map", "map"),
+    ]
+    for sample in answers:
+        read = adapter.validate_json(adapter.dump_json(sample))
+        assert read == adapter.validate_python(adapter.dump_python(sample)) == sample
+        assert json.loads(adapter.dump_json(sample)) == sample.to_dict() == read.to_dict()
+        assert adapter.validate_python(sample) is sample
+        assert adapter.validate_python(sample.to_dict(stamps="text")) == sample
+    short = {
+        "parent": "map",
+        "child": "cart",
+        "stamp": 1,
+        "transform": {"translation": [1, 2, 3], "rotation": [0, 0, 0, 1]},
+    }
+    assert adapter.validate_python(short) == TransformStamped("map", "cart", 1, Transform((1, 2, 3)))
+    bad = {**short, "transform": {"translation": [1, 2, 3], "rotation": [0, 0, 0, 9]}}
+    wrongs: list[Any] = [bad, {**short, "child": ""}, {**short, "more": 1}, {**short, "stamp": 1.5}, [], {}]
+    for wrong in wrongs:
+        with pytest.raises(pydantic.ValidationError):
+            adapter.validate_python(wrong)
+    poses, pose = pydantic.TypeAdapter(tfbus.PoseStamped), tfbus.PoseStamped("map", TODAY, Transform())
+    assert poses.validate_json(poses.dump_json(pose)) == pose
+    schema = adapter.json_schema(mode="serialization")
+    assert schema == adapter.json_schema() and schema["required"] == ["parent", "child", "stamp", "transform"]
+    assert schema["properties"]["stamp"]["type"] == "integer"
+    assert schema["$defs"]["Transform"]["properties"]["rotation"]["minItems"] == 4

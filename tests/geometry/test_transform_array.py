@@ -2,6 +2,7 @@ import copy
 import math
 import operator
 import pickle
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -416,3 +417,9 @@ def test_a_data_frame_has_dates_in_utc_to_the_nanosecond_and_angles(library: str
 def test_a_data_frame_is_of_pandas_or_polars() -> None:
     with pytest.raises(ValueError, match="'pandas' or 'polars', not 'os'"):
         ahead(0.0).to_dataframe("os")
+
+
+def test_a_missing_library_of_data_frames_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r'pip install "tfbus\[pandas\]"'):
+        ahead(0.0).to_dataframe()

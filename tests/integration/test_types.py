@@ -1,6 +1,10 @@
-"""Pyright, which editors run, finds no fault with the demos, nor with sequences where docstrings allow them."""
+"""Type checkers find typos on every public class, and no fault with the demos or with calls that docstrings allow."""
 
+import importlib
+import inspect
 import json
+import os
+import re
 import shutil
 import subprocess
 import sys
@@ -9,11 +13,27 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("pyright", reason="the extra thorough is not installed")
+pytest.importorskip("pyright", reason="the extra dev is not installed")
 
 pytestmark = pytest.mark.thorough
 
 ROOT = Path(__file__).parents[2]
+DOORS = ["tfbus", "tfbus.analysis", "tfbus.links", "tfbus.recording", "tfbus.robot"]
+CHECKERS = {
+    "mypy": ["-m", "mypy", "--no-error-summary", "--cache-dir", "cache", "--config-file", ""],
+    "pyright": ["-m", "pyright", "--pythonpath", sys.executable],
+    "ty": [
+        "-m",
+        "ty",
+        "check",
+        "--output-format",
+        "concise",
+        "--python",
+        sys.executable,
+        "--extra-search-path",
+        str(ROOT),
+    ],
+}
 CALLS = """
 import numpy as np
 import tfbus
@@ -62,3 +82,20 @@ def test_sequences_are_accepted_by_types_as_by_docstrings(tmp_path: Path) -> Non
     assert faults(tmp_path, "basic") == []
     (tmp_path / "calls.py").write_text('import tfbus\ntfbus.PointStamped("map", 0, "123")\n', encoding="utf-8")
     assert [name for name, _ in faults(tmp_path, "basic")] == ["calls.py"]
+
+
+@pytest.mark.parametrize("checker", CHECKERS)
+def test_a_typo_on_any_public_class_is_caught(checker: str, tmp_path: Path) -> None:
+    pytest.importorskip(checker, reason="the extra dev is not installed")
+    rooms = [importlib.import_module(door) for door in DOORS]
+    named = [(room.__name__, name) for room in rooms for name in room.__all__ if inspect.isclass(getattr(room, name))]
+    classes = [f"{door}.{name}" for door, name in named]
+    imports = [f"import {door}" for door in DOORS]
+    typos = [f"def use_{line}(thing: {name}) -> None: thing.no_such_name" for line, name in enumerate(classes)]
+    (tmp_path / "typos.py").write_text("\n".join([*imports, *typos]), encoding="utf-8")
+    command = [sys.executable, *CHECKERS[checker], "typos.py"]
+    environment = {**os.environ, "MYPYPATH": str(ROOT), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment)
+    caught = {int(line) for line in re.findall(r"typos\.py:(\d+).*no_such_name", done.stdout)}
+    missed = [name for line, name in enumerate(classes, len(imports) + 1) if line not in caught]
+    assert (missed, len(classes) > 80) == ([], True), done.stderr[-500:]

@@ -59,7 +59,7 @@ class WebDoor:
             raise TypeError(f"origins must be several addresses, not {origins!r}")
         own = socket.gethostname().lower()
         short = own.partition(".")[0]
-        self.refused = 0
+        self.refused: int = 0
         self._names = {"localhost", host.lower().rstrip("."), own, short, f"{short}.local"}
         self._origins: set[tuple[str, _Place]] = set()
         self._applications: set[str] = set()

@@ -94,6 +94,15 @@ class Arrivals:
     ----------
     window : float
         Its length in s.
+
+    Examples
+    --------
+    >>> from tfbus.analysis import Arrivals
+    >>> arrivals = Arrivals(window=5.0)
+    >>> for stamp in range(0, SECOND, SECOND // 10):
+    ...     arrivals.note((TransformStamped("map", "cart", stamp, Transform()),), stamp)
+    >>> [(each.frame, each.samples) for each in arrivals.measure(SECOND)]
+    [('cart', 10)]
     """
 
     def __init__(self, window: float) -> None:
@@ -101,7 +110,16 @@ class Arrivals:
         self._received: dict[tuple[str, str], _Received] = {}
 
     def note(self, batch: Batch, now: int) -> None:
-        """Count the samples of a batch that arrives at the stamp `now`, in ns."""
+        """Count the samples of a batch that arrives at the stamp `now`, in ns.
+
+        Examples
+        --------
+        >>> from tfbus.analysis import Arrivals
+        >>> arrivals = Arrivals(window=5.0)
+        >>> arrivals.note((TransformStamped("map", "cart", 0, Transform(), "odometry"),), now=10)
+        >>> arrivals.measure(10)[0].authority
+        'odometry'
+        """
         for sample in batch:
             key = sample.child, sample.authority
             received = self._received.get(key)
@@ -112,12 +130,29 @@ class Arrivals:
                 received.times.append((now, sample.stamp))
 
     def forget(self, frame: str) -> None:
-        """Forget a frame that was removed."""
+        """Forget a frame that was removed.
+
+        Examples
+        --------
+        >>> from tfbus.analysis import Arrivals
+        >>> arrivals = Arrivals(window=5.0)
+        >>> arrivals.note((TransformStamped("map", "cart", 0, Transform()),), now=10)
+        >>> arrivals.forget("cart")
+        >>> arrivals.measure(10)
+        []
+        """
         for key in [key for key in self._received if key[0] == frame]:
             del self._received[key]
 
     def measure(self, now: int) -> list[Arrival]:
-        """Each frame and sender, sorted by both; a pair that was silent for the whole window stays, without a rate."""
+        """Each frame and sender, sorted by both; a pair that was silent for the whole window stays, without a rate.
+
+        Examples
+        --------
+        >>> from tfbus.analysis import Arrivals
+        >>> Arrivals(window=5.0).measure(0)
+        []
+        """
         found = []
         for (frame, authority), received in sorted(self._received.items()):
             times = received.times

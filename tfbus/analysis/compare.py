@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,12 @@ class Alignment:
     ----------
     transform : Transform
     scale : float
+
+    Examples
+    --------
+    >>> from tfbus.analysis import Alignment
+    >>> Alignment(Transform((1.0, 0.0, 0.0)), scale=2.0).scale
+    2.0
     """
 
     transform: Transform
@@ -47,6 +53,14 @@ class Alignment:
         ------
         ValueError
             If the points do not determine a rotation, because all of them are on a line.
+
+        Examples
+        --------
+        >>> from tfbus.analysis import Alignment
+        >>> corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        >>> alignment = Alignment.between(corners, corners + (1.0, 0.0, 0.0), False)
+        >>> alignment.transform.is_close(Transform((1.0, 0.0, 0.0)))
+        True
         """
         mean, mean_reference = points.mean(axis=0), reference.mean(axis=0)
         centred = points - mean
@@ -86,6 +100,13 @@ class PoseErrors:
         m.
     rotation : float64 array of shape (n,)
         rad, from 0 to pi.
+
+    Examples
+    --------
+    >>> from tfbus.analysis import PoseErrors
+    >>> errors = PoseErrors(np.array([0, 1]), np.array([0.1, 0.3]), np.zeros(2))
+    >>> round(errors.statistics()[0].mean, 6)
+    0.2
     """
 
     stamps: npt.NDArray[np.int64]
@@ -99,6 +120,13 @@ class PoseErrors:
         ------
         ValueError
             If there are no errors, because there is only one pose.
+
+        Examples
+        --------
+        >>> from tfbus.analysis import PoseErrors
+        >>> translation, rotation = PoseErrors(np.array([0]), np.array([0.5]), np.array([0.0])).statistics()
+        >>> translation.rmse, rotation.max
+        (0.5, 0.0)
         """
         if not len(self.stamps):
             raise ValueError("there are no errors: a step needs two poses")
@@ -120,7 +148,7 @@ _Rows = npt.NDArray[np.float64]
 _Stamps = npt.NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Comparison:
     """The errors of a trajectory.
 
@@ -147,6 +175,22 @@ class Comparison:
     relative: PoseErrors
     reference: TransformArray
     estimate: TransformArray
+
+    def __str__(self) -> str:
+        lines = [f"{self.poses:,} poses of {self.of[0]:,} and {self.of[1]:,}"]
+        lines[0] += ", not aligned" if self.alignment is None else f", aligned with scale {self.alignment.scale:g}"
+        lines.append(" " * 24 + "".join(f"{name:>10}" for name in Statistics.__match_args__))
+        for name, errors in (("absolute", self.absolute), ("relative", self.relative)):
+            found = errors.statistics() if len(errors.stamps) else ()
+            for part, values in zip(("translation [m]", "rotation [rad]"), found, strict=False):
+                lines.append(f"{name} {part:<15}" + "".join(f"{value:10.4g}" for value in astuple(values)))
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"<Comparison of {self.poses:,} poses>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{self}</pre>"
 
 
 def compare(
@@ -192,6 +236,21 @@ def compare(
     ValueError
         If there are no two poses at about the same stamp, the trajectories cannot be aligned, or `delta` is less than
         one, or `max_difference` negative.
+
+    Examples
+    --------
+    >>> from tfbus.analysis import compare
+    >>> wanted, found = TransformTree(), TransformTree()
+    >>> for stamp in range(3):
+    ...     _ = wanted.insert(TransformStamped("map", "cart", stamp, Transform((stamp, 0.0, 0.0))))
+    ...     _ = found.insert(TransformStamped("map", "cart", stamp, Transform((stamp, 0.5, 0.0))))
+    >>> print(compare(wanted, found, "map", "cart"))
+    3 poses of 3 and 3, not aligned
+                                  rmse      mean    median       std       min       max
+    absolute translation [m]       0.5       0.5       0.5         0       0.5       0.5
+    absolute rotation [rad]          0         0         0         0         0         0
+    relative translation [m]         0         0         0         0         0         0
+    relative rotation [rad]          0         0         0         0         0         0
     """
     if delta < 1:
         raise ValueError(f"delta must be at least 1, got {delta}")

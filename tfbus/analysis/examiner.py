@@ -63,6 +63,13 @@ class Finding:
         The fault in words.
     at : int or None
         The stamp of the worst case, in ns.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> _ = tree.insert(TransformStamped("map", "cart", 0, Transform((2e8, 0.0, 0.0))))
+    >>> print(diagnose(tree)[0].detail)
+    farther than 1e+08 m
     """
 
     kind: str
@@ -115,6 +122,14 @@ class Limits:
     ------
     TypeError, ValueError
         If one of them is not a number greater than zero.
+
+    Examples
+    --------
+    >>> from tfbus.analysis import Limits
+    >>> tree = TransformTree()
+    >>> _ = tree.insert(TransformStamped("map", "cart", 0, Transform((20.0, 0.0, 0.0))))
+    >>> diagnose(tree, Limits(translation=10.0))[0].kind
+    'translation'
     """
 
     translation: float = 1e8
@@ -288,6 +303,14 @@ class Examiner:
     Parameters
     ----------
     limits : Limits, optional
+
+    Examples
+    --------
+    >>> from tfbus.analysis import Examiner
+    >>> examiner = Examiner()
+    >>> examiner.add([TransformStamped("map", "cart", 0, Transform((2e8, 0.0, 0.0)))])
+    >>> [finding.kind for finding in examiner.findings()]
+    ['translation']
     """
 
     def __init__(self, limits: Limits | None = None) -> None:
@@ -304,6 +327,14 @@ class Examiner:
         batch : iterable of TransformStamped
         received : int, optional
             The time of their arrival, in ns. Without it, they are taken to arrive in the order of their stamps.
+
+        Examples
+        --------
+        >>> from tfbus.analysis import Examiner
+        >>> examiner = Examiner()
+        >>> examiner.add([TransformStamped("map", "cart", 0, Transform())], received=10)
+        >>> examiner.findings()
+        []
         """
         for sample in batch:
             frame = self._frames.get(sample.child)
@@ -312,18 +343,44 @@ class Examiner:
             frame.add(sample, received)
 
     def add_refused(self, reasons: Iterable[str]) -> None:
-        """Note samples or messages that were refused, by reason."""
+        """Note samples or messages that were refused, by reason.
+
+        Examples
+        --------
+        >>> from tfbus.analysis import Examiner
+        >>> examiner = Examiner()
+        >>> examiner.add_refused(["not finite"])
+        >>> [finding.detail for finding in examiner.findings()]
+        ['not accepted: not finite']
+        """
         self._refused.update(reasons)
 
     def add_norm(self, frame: str, stamp: int, norm: float) -> None:
-        """Note the norm that a quaternion had before it was normalised."""
+        """Note the norm that a quaternion had before it was normalised.
+
+        Examples
+        --------
+        >>> from tfbus.analysis import Examiner
+        >>> examiner = Examiner()
+        >>> examiner.add([TransformStamped("map", "cart", 0, Transform())])
+        >>> examiner.add_norm("cart", 0, 1.005)
+        >>> [finding.detail for finding in examiner.findings()]
+        ['a quaternion whose norm is not one']
+        """
         off = abs(norm - 1.0)
         if off > self._limits.norm:
             count, first, worst = self._uneven.get(frame, (0, stamp, 0.0))
             self._uneven[frame] = count + 1, first, max(worst, off)
 
     def findings(self) -> list[Finding]:
-        """All faults: first the faults of the whole tree, then the faults of each frame."""
+        """All faults: first the faults of the whole tree, then the faults of each frame.
+
+        Examples
+        --------
+        >>> from tfbus.analysis import Examiner
+        >>> Examiner().findings()
+        []
+        """
         found = list(self._of_the_tree())
         for name in sorted(self._frames):
             found += self._frames[name].findings(self._limits)
@@ -456,6 +513,13 @@ def diagnose(tree: TransformTree, limits: Limits | None = None) -> list[Finding]
     -------
     list of Finding
         Empty if nothing is wrong.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> _ = tree.insert(TransformStamped("map", "cart", 0, Transform((2e8, 0.0, 0.0))))
+    >>> [finding.kind for finding in diagnose(tree)]
+    ['translation']
     """
     examiner = Examiner(limits)
     forest = forest_of(tree)

@@ -1,5 +1,7 @@
 """The buffer: a tree that a bus fills, and lookups that wait for missing transforms."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -22,7 +24,7 @@ from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
 from tfbus.tree.lookup import Hold, Question, answer, policy_of, question_of
 from tfbus.tree.lookup_many import deskew, deskew_stamps
-from tfbus.tree.rendering import counted, describe, legend, to_html
+from tfbus.tree.rendering import cell, counted, describe, to_html
 from tfbus.tree.tree import TransformTree, forest_of, tree_of, window_of
 from tfbus.waiting.live_tree import LiveTree, PendingLookup
 from tfbus.which_kernel import plain_first
@@ -98,7 +100,7 @@ class Buffer:
         *,
         prefix: str | None = None,
         shared: Iterable[str] = (),
-        prefill: "Buffer | TransformTree | None" = None,
+        prefill: Buffer | TransformTree | None = None,
     ) -> None:
         self.bus = bus
         self._clock = bus.clock
@@ -110,7 +112,7 @@ class Buffer:
         self._lookups = Lookups(self._share, bus, self._local_names)
         self._stand_on(self._share.live.forest)
 
-    def _prefilled(self, prefill: "Buffer | TransformTree | None", window: int | None) -> Forest | LiveTree | None:
+    def _prefilled(self, prefill: Buffer | TransformTree | None, window: int | None) -> Forest | LiveTree | None:
         """Nothing to begin with, or the live tree of a buffer that has all it would have, or a copy of a buffer."""
         if prefill is None:
             return None
@@ -254,6 +256,15 @@ class Buffer:
             At once, if a name cannot be the name of a frame: empty, or with a leading slash.
         TypeError
             If a stamp is a float, or `max_age` comes without a `LATEST`.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> bus = Bus(clock)
+        >>> with Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send("map", "cart", Transform((1.0, 2.0, 0.0)))
+        ...     print((await buffer.lookup("map", "cart", clock.now(), timeout=1.0)).transform.translation)
+        (1.0, 2.0, 0.0)
         """
         waits_plainly = max_age is None and source_at is None and fixed is None and not tolerance
         if self._feed is None or not waits_plainly or max_gap is not None or extrapolate is not None:
@@ -324,6 +335,14 @@ class Buffer:
             is given.
         TransformError
             As `lookup`.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> TransformBroadcaster(bus).send_static("base_link", "laser", Transform((0.1, 0.0, 0.2)))
+        >>> with Buffer(bus) as buffer:
+        ...     print(await buffer.transform(PointStamped("laser", 0, (1.0, 0.0, 0.0)), "base_link", timeout=1.0))
+        PointStamped(frame='base_link', stamp=0, point=(1.1, 0.0, 0.2))
         """
         question = question_of(data, target, as_at(at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
         if self._is_in_place(question):
@@ -422,6 +441,14 @@ class Buffer:
             As `lookup_nowait`, if there is no answer now.
         TypeError
             As `transform`.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> TransformBroadcaster(bus).send_static("base_link", "laser", Transform((0.1, 0.0, 0.2)))
+        >>> with Buffer(bus) as buffer:
+        ...     print(buffer.transform_nowait(PointStamped("laser", 0, (1.0, 0.0, 0.0)), "base_link").point)
+        (1.1, 0.0, 0.2)
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         if at is None and fixed is None and max_age is None and policy is None:
@@ -434,13 +461,24 @@ class Buffer:
         return do_transform(data, self._lookups.lookup_nowait(self._on_bus(question)))
 
     async def can_transform_within(
-        self, target: str, source: str, timeout: float | None, at: AtLike = LATEST, **question: Any
+        self,
+        target: str,
+        source: str,
+        timeout: float | None,
+        at: AtLike = LATEST,
+        *,
+        max_age: float | None = None,
+        source_at: AtLike | None = None,
+        fixed: str | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
     ) -> bool:
         """Whether `lookup` with the same arguments has an answer within a time; tf2's ``can_transform`` with a timeout.
 
         Parameters
         ----------
-        target, source, at, question
+        target, source, at, max_age, source_at, fixed, tolerance, max_gap, extrapolate
             As `lookup`.
         timeout : float or None
             In s, on the bus's clock; None waits for ever.
@@ -454,20 +492,72 @@ class Buffer:
         ------
         BusClosedError, ClockResetError, TypeError
             As `lookup`.
+
+        Examples
+        --------
+        >>> with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        ...     print(await buffer.can_transform_within("map", "cart", 0.0))
+        False
         """
         try:
-            await self.lookup(target, source, at, timeout=timeout, **question)
+            await self.lookup(
+                target,
+                source,
+                at,
+                timeout=timeout,
+                max_age=max_age,
+                source_at=source_at,
+                fixed=fixed,
+                tolerance=tolerance,
+                max_gap=max_gap,
+                extrapolate=extrapolate,
+            )
         except TransformLookupError:
             return False
         return True
 
-    def can_transform(self, target: str, source: str, at: AtLike = LATEST, **question: Any) -> bool:
-        """Whether `lookup_nowait` with the same arguments has an answer now."""
-        known = None if question else self._paths.can_answer(target, source, at)
-        if known is not None:
-            return known
+    def can_transform(
+        self,
+        target: str,
+        source: str,
+        at: AtLike = LATEST,
+        *,
+        max_age: float | None = None,
+        source_at: AtLike | None = None,
+        fixed: str | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> bool:
+        """Whether `lookup_nowait` with the same arguments has an answer now.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send("map", "cart", Transform(), at=10)
+        ...     print([buffer.can_transform("map", "cart", stamp) for stamp in (10, 11)])
+        ...     print(buffer.can_transform("map", "cart", 11, tolerance=0.1))
+        [True, False]
+        True
+        """
+        travels = source_at is not None or fixed is not None
+        if not (travels or tolerance or max_age is not None or max_gap is not None or extrapolate is not None):
+            known = self._paths.can_answer(target, source, at)
+            if known is not None:
+                return known
         try:
-            self.lookup_nowait(target, source, at, **question)
+            self.lookup_nowait(
+                target,
+                source,
+                at,
+                max_age=max_age,
+                source_at=source_at,
+                fixed=fixed,
+                tolerance=tolerance,
+                max_gap=max_gap,
+                extrapolate=extrapolate,
+            )
         except TransformLookupError:
             return False
         return True
@@ -522,6 +612,16 @@ class Buffer:
         TypeError, ValueError
             If a threshold is negative or an angle of more than pi, a rate is not greater than zero, or something is not
             a number.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer, buffer.watch("map", "cart") as changes:
+        ...     TransformBroadcaster(bus).send("map", "cart", Transform((1.0, 0.0, 0.0)), at=10)
+        ...     async for transform in changes:
+        ...         print(transform)
+        ...         break
+        map <- cart at 0.00000001 s: Transform(translation=(1.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0, 1.0))
         """
         self.bus._check_thread()
         question = Question(target, source, LATEST, max_age=max_age, policy=policy_of(tolerance, max_gap, extrapolate))
@@ -547,6 +647,14 @@ class Buffer:
         """An explanation of the answer of `lookup_nowait`, or of everything that blocks it.
 
         See `TransformTree.explain`; ages are counted from the clock's now.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send("map", "cart", Transform(), at=0)
+        ...     print(buffer.explain("map", "cart", 0).answerable)
+        True
         """
         instant = as_at(at)
         asked = self._on_bus(Question(target, source, instant))
@@ -567,11 +675,29 @@ class Buffer:
         return found if self._local_names is None else self._local_names.explanation(found, target, source)
 
     def pending(self) -> tuple[PendingLookup, ...]:
-        """The lookups that wait now, and the watches without an answer, each with the error that blocks it."""
+        """The lookups that wait now, and the watches without an answer, each with the error that blocks it.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     print(list(buffer.pending()))
+        []
+        """
         return tuple(self._pending(None))
 
     def describe(self) -> str:
-        """The tree as text, with each edge's rate, age, span and authority, and some of the lookups that wait."""
+        """The tree as text, with each edge's rate, age, span and authority, and some of the lookups that wait.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send_static("map", "dock", Transform())
+        ...     print(buffer.describe())
+        map
+        └── dock  static
+        """
         lines = [describe(self._edges(), self._clock.now())]
         lines += [f"waiting: {lookup}" for lookup in self._pending(_DESCRIBED)]
         more = len(self._share.waiters) - _DESCRIBED
@@ -580,11 +706,28 @@ class Buffer:
         return "\n".join(lines)
 
     def on_close(self, callback: Callable[[], object]) -> Registration:
-        """Call `callback` once, on the event loop: when this buffer or its bus is closed, or now if one is."""
+        """Call `callback` once, on the event loop: when this buffer or its bus is closed, or now if one is.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     registration = buffer.on_close(lambda: print("no more samples come"))
+        ...     bus.close()
+        no more samples come
+        """
         return self._share.on_end(callback)
 
     def close(self) -> None:
-        """Leave the bus; waiting lookups end with `BusClosedError`. Buffered transforms can still be looked up."""
+        """Leave the bus; waiting lookups end with `BusClosedError`. Buffered transforms can still be looked up.
+
+        Examples
+        --------
+        >>> buffer = Buffer(Bus(SimulatedClock()))
+        >>> buffer.close()
+        >>> buffer
+        <Buffer of 0 frames, keeps 10 s, closed>
+        """
         if self.bus._detach(self._share):
             self._share.live.keep_for(self, self._tree)
         self._share.end("the buffer is closed")
@@ -602,7 +745,7 @@ class Buffer:
 
     def _repr_html_(self) -> str:
         """The tree as notebooks show it, with ages counted from the clock's now."""
-        return to_html(self._edges(), self._clock.now()) + legend()
+        return cell(to_html(self._edges(), self._clock.now()))
 
     def _pending(self, most: int | None) -> Iterable[PendingLookup]:
         pending = self._lookups.pending(most)
@@ -626,7 +769,7 @@ class Buffer:
         """A question with the names of the bus."""
         return question if self._local_names is None else self._local_names.question(question)
 
-    def __enter__(self) -> "Buffer":
+    def __enter__(self) -> Buffer:
         return self
 
     def __exit__(

@@ -47,6 +47,7 @@ from tfbus.frames import Prefix, is_frame
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_duration, from_seconds, to_seconds
 from tfbus.tree.explanation import Explanation
+from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
 from tfbus.tree.lookup import Bounds, Question, answer
 from tfbus.waiting.live_tree import PendingLookup, Share, Waiter, without_traceback
@@ -72,7 +73,7 @@ class LoopTimer:
 
     def __init__(self, loop: Any, callback: Callable[[], object]) -> None:
         self.loop = loop
-        self.due = math.inf
+        self.due: float = math.inf
         self._callback = callback
         self._trio = None if hasattr(loop, "call_at") else cast(Any, sys.modules["trio"])
         self._handle: Any = None
@@ -249,7 +250,7 @@ class AlarmHeap:
     """The alarms on one event loop by their times, with one timer for the first."""
 
     def __init__(self, loop: Any) -> None:
-        self.timer = LoopTimer(loop, self._ring)
+        self.timer: LoopTimer = LoopTimer(loop, self._ring)
         self._now = self.timer.now
         # With a list of the callback, which is empty once the call is made or cancelled.
         self._alarms: list[tuple[float, int, list[Callable[[], object]]]] = []
@@ -372,7 +373,7 @@ class Wait(Waiter):
     """A lookup that waits, from its first error to its end."""
 
     sleep: Generator[Any, None, None]
-    expired = False
+    expired: bool = False
 
     def expire(self) -> None:
         """End the wait."""
@@ -411,11 +412,11 @@ class Lookups:
         local_names: LocalNames | None = None,
     ) -> None:
         self.share = share
-        self.forest = share.live.forest
+        self.forest: Forest = share.live.forest
         self.bus = bus
         self._clock = bus.clock
         # One call less, as each wait notes when it began.
-        self.now = time_ns if type(bus.clock) is SystemClock else bus.clock.now
+        self.now: Callable[[], int] = time_ns if type(bus.clock) is SystemClock else bus.clock.now
         self._is_here = bus._is_here
         self._local_names = local_names
         self._alarms = alarms_of(bus.clock)
@@ -423,7 +424,7 @@ class Lookups:
         # The loop on which the next look at the lookups that hang is due, if one is, and the function that cancels it.
         self._looking_on: Any = None
         self._cancel_look: Cancel = _nothing
-        self.feed = share.feed
+        self.feed: Any = share.feed
         if self.feed is not None:
             self.feed.kind, self.feed.here, self.feed.begin = Wait, here, self.begin
 

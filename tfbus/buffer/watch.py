@@ -29,6 +29,16 @@ class Watch:
     ----------
     skipped : int
         Number of batches that touched the watched path but appear in no answer, because a later batch had come.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with Buffer(bus) as buffer, buffer.watch("map", "cart") as changes:
+    ...     TransformBroadcaster(bus).send("map", "cart", Transform((1.0, 0.0, 0.0)), at=10)
+    ...     async for transform in changes:
+    ...         print(transform.stamp)
+    ...         changes.close()
+    10
     """
 
     def __init__(
@@ -46,7 +56,7 @@ class Watch:
                 raise UnknownFrameError(frame=name, known=lookups.forest.some_frames())
         if question.max_age is not None:
             lookups.bounds(question.max_age, question.at, question.source_at)
-        self.skipped = 0
+        self.skipped: int = 0
         self._question = question
         self._min_translation = _threshold(min_translation, "min_translation", "m", math.inf)
         self._min_rotation = _threshold(min_rotation, "min_rotation", "rad", math.pi)
@@ -71,7 +81,16 @@ class Watch:
         self._state.outdated = True
 
     def close(self) -> None:
-        """End the iteration; a second call does nothing."""
+        """End the iteration; a second call does nothing.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer, buffer.watch("map", "cart") as changes:
+        ...     changes.close()
+        ...     print([transform async for transform in changes])
+        []
+        """
         if self._state.waiting:
             self._check_thread()
         self._watching.remove(self._state)

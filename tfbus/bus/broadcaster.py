@@ -1,5 +1,7 @@
 """A publisher of transforms under one authority."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Protocol
@@ -83,7 +85,7 @@ class TransformBroadcaster:
     ) -> None:
         if not isinstance(authority, str):
             raise TypeError(f"authority must be a str, not {authority!r}")
-        self.bus = bus if isinstance(bus, Bus) else bus.bus
+        self.bus: Bus = bus if isinstance(bus, Bus) else bus.bus
         self._to = bus
         self.authority = authority
         self._prefix = as_prefix(prefix, shared)
@@ -105,6 +107,15 @@ class TransformBroadcaster:
         InvalidTransformError
             If a name or the stamp is bad, or the bus refuses the sample, as `Bus.publish` says. Nothing is stored.
         BusClosedError, TypeError
+
+        Examples
+        --------
+        >>> bus = Bus(clock=SimulatedClock())
+        >>> broadcaster = TransformBroadcaster(bus, authority="odometry")
+        >>> with Buffer(bus) as buffer:
+        ...     broadcaster.send("map", "cart", Transform((1.0, 2.0, 0.0)), at=from_seconds(0.5))
+        ...     print(buffer.lookup_nowait("map", "cart").stamp)
+        500000000
         """
         if self._prefix is not None:
             parent, child = self._on_bus(parent), self._on_bus(child)
@@ -127,6 +138,14 @@ class TransformBroadcaster:
         InvalidTransformError
             If one of them is bad. Nothing is stored.
         BusClosedError, TypeError
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send_all([("map", "odom", Transform()), ("odom", "cart", Transform())], at=0)
+        ...     print(buffer.can_transform("map", "cart"))
+        True
         """
         stamp = self._stamp(at)
         self._to.publish([self._sample(sample, stamp) for sample in samples], self._invalid)
@@ -156,6 +175,15 @@ class TransformBroadcaster:
         ------
         InvalidTransformError, BusClosedError, TypeError, ValueError
             As `Bus.publish_columns`.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> places, turns = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 1.0)] * 2
+        >>> with Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send_columns("map", "cart", places, turns, [0, 10])
+        ...     print(buffer.lookup_nowait("map", "cart", 5).transform.translation)
+        (0.5, 0.0, 0.0)
         """
         above, below = (
             (self._on_bus(names) if isinstance(names, str) else [*map(self._on_bus, names)])
@@ -173,6 +201,14 @@ class TransformBroadcaster:
         ------
         InvalidTransformError, BusClosedError, TypeError
             As `send`.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> TransformBroadcaster(bus).send_static("base_link", "laser", Transform((0.1, 0.0, 0.2)))
+        >>> with Buffer(bus) as late:
+        ...     print(late.lookup_nowait("base_link", "laser").static)
+        True
         """
         parent, child = self._on_bus(parent), self._on_bus(child)
         sample = TransformStamped(parent, child, self.bus.clock.now(), transform, self.authority, static=True)
@@ -262,6 +298,16 @@ class TransformBroadcaster:
         TypeError
             If no frame is given.
         BusClosedError
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> broadcaster = TransformBroadcaster(bus)
+        >>> with Buffer(bus) as buffer:
+        ...     with broadcaster.owning("tool0"):
+        ...         broadcaster.send("flange", "tool0", Transform())
+        ...     print("tool0" in buffer.tree)
+        False
         """
         if not frames:
             raise TypeError("owning needs at least one frame")

@@ -5,6 +5,8 @@ every buffer, wakes the lookups that waited for it, then calls the subscribers. 
 nothing can be lost between "sent" and "buffered".
 """
 
+from __future__ import annotations
+
 import asyncio
 import logging
 import os
@@ -14,7 +16,7 @@ from contextlib import AbstractContextManager, suppress
 from itertools import chain
 from threading import get_ident
 from types import TracebackType
-from typing import Any
+from typing import Any, SupportsIndex
 from weakref import WeakSet
 
 import anyio
@@ -113,7 +115,7 @@ class OwnerThread:
             self._set(0)
 
     def _set(self, thread: int) -> None:
-        self.thread = thread
+        self.thread: int = thread
         if self._intake is not None:
             self._intake.thread = thread
 
@@ -295,6 +297,14 @@ class Bus:
         RuntimeError
             If this is not the bus's thread, or this process was forked and has the bus without its links; if
             subscribers that publish have queued more than 1,000 batches.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     bus.publish(TransformStamped("map", "cart", 0, Transform((1.0, 2.0, 0.0)), "odometry"))
+        ...     print(buffer.can_transform("map", "cart"))
+        True
         """
         # The usual case: samples only continue known edges.
         taken = self._take(samples, invalid)
@@ -401,6 +411,13 @@ class Bus:
         Raises
         ------
         BusClosedError
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with bus.subscribe(lambda batch: print([sample.child for sample in batch])):
+        ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+        ['cart']
         """
         self._check_usable()
         return self._subscribers.subscribe(callback, tuple(self._topology.latched.samples.values()), removed)
@@ -418,6 +435,16 @@ class Bus:
         Raises
         ------
         BusClosedError
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with bus.stream(capacity=100) as batches:
+        ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+        ...     async for batch in batches:
+        ...         print(batch[0].child)
+        ...         break
+        cart
         """
         self._check_usable()
         stream = Stream(capacity, overflow, self._check_thread, self._detach_stream)
@@ -449,6 +476,16 @@ class Bus:
         ValueError
             If `capacity` is less than one, or `stale_after` negative.
         BusClosedError
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with bus.events() as events:
+        ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+        ...     async for event in events:
+        ...         print(event)
+        ...         break
+        0.000 s: moving frame 'cart' is new under 'map', from ''
         """
         self._check_usable()
         events = EventStream(capacity, stale_after, self._topology, self.clock, self._check_thread, self._detach_events)
@@ -488,11 +525,19 @@ class Bus:
         InvalidTransformError
             If another authority has reserved it, or the name cannot be the name of a frame.
         BusClosedError
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with bus.reserve("tool", "gripper"):
+        ...     bus.publish(TransformStamped("flange", "tool", 0, Transform(), "stranger"), invalid="drop")
+        >>> dict(bus.statistics().rejected)
+        {'reserved': 1}
         """
         self._check_usable()
         return self._topology.reserve(frame, authority)
 
-    def threadsafe(self, capacity: int = 10_000) -> "ThreadPublisher":
+    def threadsafe(self, capacity: int = 10_000) -> ThreadPublisher:
         """A function to publish from other threads: ``with bus.threadsafe() as publish``, entered on the event loop.
 
         ``publish(samples)`` may then be called from any thread. The bus publishes the queued batches with
@@ -502,6 +547,17 @@ class Bus:
         Raises
         ------
         BusClosedError
+
+        Examples
+        --------
+        >>> from threading import Thread
+        >>> bus, sample = Bus(SimulatedClock()), TransformStamped("map", "cart", 0, Transform())
+        >>> async def drive() -> None:
+        ...     with Buffer(bus) as buffer, bus.threadsafe() as publish:
+        ...         Thread(target=publish, args=(sample,)).start()
+        ...         print((await buffer.lookup("map", "cart", timeout=5.0)).child)
+        >>> await drive()
+        cart
         """
         self._check_usable()
         return ThreadPublisher(self, capacity)
@@ -572,6 +628,15 @@ class Bus:
         ------
         UnknownFrameError
             If neither the bus nor a buffer knows the frame.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+        ...     bus.remove_frame("cart")
+        ...     print("cart" in buffer.tree)
+        False
         """
         self._check_usable()
         topology = self._topology
@@ -592,7 +657,15 @@ class Bus:
         self._subscribers.notify_removed(frame)
 
     def statistics(self) -> BusStatistics:
-        """All counters, as they are now."""
+        """All counters, as they are now.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> bus.publish(TransformStamped("map", "cart", 0, Transform()))
+        >>> bus.statistics().samples
+        1
+        """
         samples = self._samples()
         return BusStatistics(
             samples=samples,
@@ -622,6 +695,13 @@ class Bus:
         """End every stream and every waiting lookup; buffers go on answering what they can.
 
         A second call does nothing.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> bus.close()
+        >>> bus
+        <Bus of 0 child frames, closed>
         """
         if self._closed:
             return
@@ -646,7 +726,10 @@ class Bus:
         for share in shares:
             share.call_end_callbacks()
 
-    def __enter__(self) -> "Bus":
+    def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[Any, ...]:
+        raise TypeError("a bus belongs to its program and cannot be copied or pickled: use Buffer(bus).tree.copy()")
+
+    def __enter__(self) -> Bus:
         return self
 
     def __exit__(
@@ -775,16 +858,26 @@ class ThreadPublisher:
     Attributes
     ----------
     bus : Bus
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> async def drive() -> None:
+    ...     with Buffer(bus) as buffer, bus.threadsafe(capacity=100) as publish:
+    ...         publish(TransformStamped("map", "cart", 0, Transform()))
+    ...         print((await buffer.lookup("map", "cart", timeout=5.0)).child)
+    >>> await drive()
+    cart
     """
 
     def __init__(self, bus: Bus, capacity: int) -> None:
-        self.queue = SampleQueue(capacity, "drop_oldest")
+        self.queue: SampleQueue = SampleQueue(capacity, "drop_oldest")
         self.bus = bus
         self._lock = threading.Lock()
         self._waker = LoopWaker(self._drain)
         self._ended = False
 
-    def __enter__(self) -> "ThreadPublisher":
+    def __enter__(self) -> ThreadPublisher:
         self._waker.bind()
         try:
             self.bus._check_usable()
@@ -838,7 +931,16 @@ class ThreadPublisher:
             raise BusClosedError("the event loop of the bus has ended") from error
 
     def publish(self, samples: TransformStamped | Iterable[TransformStamped], invalid: Invalid = "drop") -> None:  # noqa: ARG002
-        """Hand samples over as a call does; for `invalid`, as the bus has it, there is no choice here."""
+        """Hand samples over as a call does; for `invalid`, as the bus has it, there is no choice here.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer, bus.threadsafe() as publisher:
+        ...     publisher.publish(TransformStamped("map", "cart", 0, Transform()))
+        ...     print((await buffer.lookup("map", "cart")).stamp)
+        0
+        """
         self(samples)
 
     def publish_columns(
@@ -853,7 +955,17 @@ class ThreadPublisher:
         static: bool = False,
         invalid: Invalid = "drop",  # noqa: ARG002
     ) -> None:
-        """Hand over the samples in some arrays; see `Bus.publish_columns`. A row that is no sample raises its error."""
+        """Hand over the samples in some arrays; see `Bus.publish_columns`. A row that is no sample raises its error.
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> places, turns = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 1.0)] * 2
+        >>> with Buffer(bus) as buffer, bus.threadsafe() as publisher:
+        ...     publisher.publish_columns("map", "cart", [0, 10], places, turns)
+        ...     print((await buffer.lookup("map", "cart", 5)).transform.translation)
+        (0.5, 0.0, 0.0)
+        """
         bound = self.bus.max_translation
         columns = SampleColumns(parents, children, stamps, translations, rotations, authority, static, bound)
         self(columns.samples())

@@ -82,7 +82,7 @@ class EventQueue:
     ) -> None:
         check_capacity(capacity)
         self.capacity = capacity
-        self.dropped = 0
+        self.dropped: int = 0
         self._known = deque(known)
         self._kept: deque[Event] = deque(implausible)
         self._events: deque[Event] = deque()
@@ -289,6 +289,16 @@ class EventStream(OneReaderStream[Event]):
 
     The iteration ends when the bus or the stream is closed and all pending events have been read. The stream looks for
     stale frames while a task reads and nothing else is pending; their events are never dropped.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.events() as events:
+    ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+    ...     async for event in events:
+    ...         print(type(event).__name__)
+    ...         break
+    FrameAdded
     """
 
     def __init__(
@@ -302,7 +312,7 @@ class EventStream(OneReaderStream[Event]):
     ) -> None:
         super().__init__(check_thread, detach)
         implausible: list[StampAhead | StampBehind] = [*topology.known_ahead(), *topology.known_behind()]
-        self.queue = EventQueue(capacity, topology.known(), implausible)
+        self.queue: EventQueue = EventQueue(capacity, topology.known(), implausible)
         self._staleness: Staleness | None = None
         if stale_after is not None and as_duration(stale_after, "stale_after") != math.inf:
             self._staleness = Staleness(from_seconds(stale_after), topology.newest)

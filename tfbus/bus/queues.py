@@ -50,8 +50,8 @@ class SampleQueue:
             raise ValueError(f"overflow must be 'conflate' or 'drop_oldest', not {overflow!r}")
         self.capacity = capacity
         self.overflow: Overflow = overflow
-        self.dropped = 0
-        self.conflated = 0
+        self.dropped: int = 0
+        self.conflated: int = 0
         # With "conflate", the newest sample of each child; with "drop_oldest", batches, and the static samples of
         # dropped batches.
         self._newest: dict[str, TransformStamped] = {}
@@ -187,6 +187,17 @@ class Stream(OneReaderStream[Batch]):
     """The result of `Bus.stream`: ``async for batch in stream``, for one reader.
 
     The iteration ends when the bus or the stream is closed and all pending batches have been read.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.stream(overflow="conflate") as batches:
+    ...     for stamp in range(3):
+    ...         bus.publish(TransformStamped("map", "cart", stamp, Transform()))
+    ...     async for batch in batches:
+    ...         print([sample.stamp for sample in batch])
+    ...         break
+    [2]
     """
 
     def __init__(
@@ -197,7 +208,7 @@ class Stream(OneReaderStream[Batch]):
         detach: Callable[["Stream"], object],
     ) -> None:
         super().__init__(check_thread, detach)
-        self.queue = SampleQueue(capacity, overflow)
+        self.queue: SampleQueue = SampleQueue(capacity, overflow)
 
     @property
     def dropped(self) -> int:

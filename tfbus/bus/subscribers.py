@@ -171,7 +171,7 @@ class Subscribers:
         self._current: Batch = ()
         self.calling: list[Callable[..., object]] = []
         self._queued = 0
-        self.failures = 0
+        self.failures: int = 0
 
     def subscribe(self, callback: BatchCallback, latched: Batch, removed: FrameCallback | None = None) -> Registration:
         """Register a callback, and call it with the latched samples if there are any."""

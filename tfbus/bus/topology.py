@@ -83,7 +83,7 @@ class Plausibility:
         reject_ahead: bool,
         max_behind: float | None = None,
     ) -> None:
-        self.max_translation = as_max_translation(max_translation)
+        self.max_translation: float = as_max_translation(max_translation)
         self._max_ahead = _as_bound(max_ahead, "max_ahead")
         self._max_behind = _as_bound(max_behind, "max_behind")
         if reject_ahead and self._max_ahead is None:
@@ -265,16 +265,16 @@ class Topology:
         self.max_frames = max_frames
         self._parents = 0
         self._newest: dict[str, _Edge] = {}
-        self.names = KnownFrames()
+        self.names: KnownFrames = KnownFrames()
         # The judge compares stamps with a reading of the clock that is at most a tenth of a second old; a simulated
         # clock is read after each of its moves.
-        self.judge = Judge(self._newest, plausibility.max_translation**2)
-        self.latched = StaticFrames()
+        self.judge: Judge = Judge(self._newest, plausibility.max_translation**2)
+        self.latched: StaticFrames = StaticFrames()
         self.rejected: Counter[str] = Counter()
-        self.reparented = 0
-        self.kind_changes = 0
-        self.conflicts = 0
-        self.ahead = 0
+        self.reparented: int = 0
+        self.kind_changes: int = 0
+        self.conflicts: int = 0
+        self.ahead: int = 0
 
     def __len__(self) -> int:
         return len(self._newest)

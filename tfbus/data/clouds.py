@@ -43,6 +43,12 @@ class PointCloud(CopiedByFields, PlainData):
     Notes
     -----
     A transform moves all points as if they had been seen at its own stamp. It does not change `stamps` and `fields`.
+
+    Examples
+    --------
+    >>> cloud = PointCloud("laser", 0, np.array([[1.0, 0.0, 0.0]], np.float32))
+    >>> do_transform(cloud, TransformStamped("base", "laser", 0, Transform((0.0, 0.0, 1.0)))).points
+    array([[1., 0., 1.]], dtype=float32)
     """
 
     frame: str

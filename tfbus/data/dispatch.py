@@ -85,7 +85,14 @@ def _build(kind: type, values: dict[str, Any]) -> Any:
 
 
 class Stamped(Protocol):
-    """Any object with a frame and a stamp."""
+    """Any object with a frame and a stamp.
+
+    Examples
+    --------
+    >>> point: Stamped = PointStamped("laser", 0, (1.0, 2.0, 3.0))
+    >>> point.frame, point.stamp
+    ('laser', 0)
+    """
 
     @property
     def frame(self) -> str:

@@ -1,5 +1,7 @@
 """Points, directions, orientations and poses; and fixes of a satellite receiver, which are places on the earth."""
 
+from __future__ import annotations
+
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
@@ -38,6 +40,11 @@ class PointStamped(PlainData):
         ns.
     point : sequence of 3 floats
         (x, y, z) in m. NaN is allowed: sensors send it for a missing point.
+
+    Examples
+    --------
+    >>> PointStamped("laser", 0, (1.0, 2.0, 3.0)).point
+    (1.0, 2.0, 3.0)
     """
 
     frame: str
@@ -63,6 +70,11 @@ class Vector3Stamped(PlainData):
         ns.
     vector : sequence of 3 floats
         (x, y, z) in any unit.
+
+    Examples
+    --------
+    >>> Vector3Stamped("laser", 0, (1.0, 2.0, 3.0)).vector
+    (1.0, 2.0, 3.0)
     """
 
     frame: str
@@ -89,6 +101,11 @@ class QuaternionStamped(PlainData):
     quaternion : sequence of 4 floats
         Unit quaternion (x, y, z, w): rotates directions of the oriented body into `frame`. A norm within 1 % of one is
         normalised; the sign stays as given.
+
+    Examples
+    --------
+    >>> QuaternionStamped("imu", 0, (0.0, 0.0, 0.0, 1.0)).quaternion
+    (0.0, 0.0, 0.0, 1.0)
     """
 
     frame: str
@@ -114,6 +131,12 @@ class PoseStamped(PlainData):
         ns.
     pose : Transform
         Maps coordinates of the posed body into `frame`.
+
+    Examples
+    --------
+    >>> base_from_tool = TransformStamped("base", "tool", 0, Transform((0.0, 0.0, 1.0)))
+    >>> do_transform(PoseStamped("tool", 0, Transform()), base_from_tool).pose.translation
+    (0.0, 0.0, 1.0)
     """
 
     frame: str
@@ -139,6 +162,11 @@ class Polygon(CopiedByFields, PlainData):
         ns.
     points : array of shape (n, 3)
         In m; copied, and read-only from then on. Floats keep their dtype, integers become float64.
+
+    Examples
+    --------
+    >>> Polygon("map", 0, [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0)]).points.shape
+    (3, 3)
     """
 
     frame: str

@@ -51,6 +51,13 @@ class LaserScan(CopiedByFields, PlainData):
         the wrong way round, or the last ray is beyond stamps of 64 bits.
     TypeError
         If a value is not a number.
+
+    Examples
+    --------
+    >>> scan = LaserScan("laser", 0, np.array([1.0, 2.0]), angle_min=0.0, angle_increment=np.pi / 2)
+    >>> scan.to_points().points.round(3)
+    array([[1., 0., 0.],
+           [0., 2., 0.]])
     """
 
     frame: str
@@ -107,6 +114,12 @@ class LaserScan(CopiedByFields, PlainData):
             instants of the rays; it is None if the stamp of the scan is `LATEST`. The field "index" has the index of
             each ray in the scan, and "intensities" its intensity, if the scan has them; both are named as in
             laser_geometry.
+
+        Examples
+        --------
+        >>> scan = LaserScan("laser", 0, np.array([1.0, np.inf]), angle_min=0.0, angle_increment=0.1, range_max=30.0)
+        >>> scan.to_points().points
+        array([[1., 0., 0.]])
         """
         ranges = self.ranges
         low, high = self.range_min, self.range_max

@@ -1,5 +1,7 @@
 """Data with a linear and an angular part: poses with covariance, twists and wrenches."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +46,11 @@ class PoseWithCovarianceStamped(CopiedByFields, PlainData):
     the pose's own origin, so no lever arm couples translation and rotation, and the transform adds no error of its own.
     NaN stays in its 3x3 block. If a variance is negative, because drivers write -1 for "unknown", the covariance stays
     as it is.
+
+    Examples
+    --------
+    >>> PoseWithCovarianceStamped("map", 0, Transform(), np.eye(6)).covariance.shape
+    (6, 6)
     """
 
     frame: str
@@ -83,6 +90,11 @@ class TwistStamped(PlainData):
 
     An answer of `TransformTree.twist` is such a twist only with ``expressed_in=frame``. By default, or with another
     frame, it has the velocity of the origin of `frame` along the axes of that other frame: do not transform it.
+
+    Examples
+    --------
+    >>> TwistStamped("base_link", 0, linear=(1.0, 0.0, 0.0), angular=(0.0, 0.0, 0.5)).angular
+    (0.0, 0.0, 0.5)
     """
 
     frame: str
@@ -143,6 +155,11 @@ class WrenchStamped(PlainData):
     A transform gives the same load at the origin of another frame: with R and t of target_from_source,
     force' = R force and torque' = R torque + t x force'. This is the adjoint map of Lynch and Park, "Modern Robotics",
     2017, section 3.4, who write the torque first; tf2 does the same in C++, and leaves out the lever arm in Python.
+
+    Examples
+    --------
+    >>> WrenchStamped("tool", 0, force=(0.0, 0.0, -9.81), torque=(0.0, 0.0, 0.0)).force
+    (0.0, 0.0, -9.81)
     """
 
     frame: str

@@ -82,7 +82,7 @@ class SampleColumns:
     def _make_plain(self) -> None:
         # A square this near to the bound can disagree with the length.
         square = 0.99 * self._bound**2
-        self.plain = columns(
+        self.plain: Any = columns(
             self._parents, self._children, self._stamps, self._rows, self._authority, self._static, square
         )
 

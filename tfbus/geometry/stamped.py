@@ -1,13 +1,15 @@
 """`TransformStamped`, a transform between two frames at an instant, and batches of such samples."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 from tfbus.errors import InvalidTransformError
 from tfbus.frames import check_frame
 from tfbus.geometry.transform import Transform, from_row
-from tfbus.plain import from_fields, printable
+from tfbus.plain import StampsAs, from_fields, printable, schema_of, with_text
 from tfbus.rows import Row
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, StampLike, as_stamp, format_duration, format_stamp, is_real
 from tfbus.tf2_names import says_ours
@@ -16,11 +18,25 @@ from tfbus.which_kernel import compose_rows, invert_row, kernel
 if kernel == "python":
     from tfbus._python_kernel import Sample
 else:
-    from tfbus._kernel import Sample  # type: ignore[assignment]
+    from tfbus._kernel import Sample
 
 Fields = tuple[str, str, int, Row, str, bool]
 
 _KINDS = {"parent": str, "child": str, "stamp": int, "transform": Transform, "authority": str, "static": bool}
+
+_POLICY_KINDS = {"extrapolated_by": int, "gap": int}
+
+
+class Changes(TypedDict, total=False):
+    """The fields of a `TransformStamped`, as `TransformStamped.replace` takes them."""
+
+    parent: str
+    child: str
+    stamp: StampLike
+    transform: Transform
+    authority: str
+    static: bool
+
 
 _NO_BEGINNING = ("", "/")
 """The first characters of strings that are not frame names."""
@@ -48,9 +64,15 @@ class TransformStamped(Sample):
         If a name is empty or starts with ``/``, child equals parent, or the stamp does not fit 64 bits.
     TypeError
         If an argument has the wrong type; a float stamp is the usual one.
+
+    Examples
+    --------
+    >>> TransformStamped("map", "cart", from_seconds(1.5), Transform((1.0, 2.0, 0.0)), authority="odometry").stamp
+    1500000000
     """
 
     __slots__ = ()
+    __match_args__ = ("parent", "child", "stamp", "transform", "authority", "static")
 
     def __init__(
         self,
@@ -115,10 +137,16 @@ class TransformStamped(Sample):
         """The time in ns between the samples that an answer was interpolated from; None without a policy."""
         return None
 
-    def replace(self, **changes: Any) -> "TransformStamped":
-        """A copy with some fields changed; all fields are checked again."""
+    def replace(self, **changes: Unpack[Changes]) -> TransformStamped:
+        """A copy with some fields changed; all fields are checked again.
+
+        Examples
+        --------
+        >>> TransformStamped("map", "cart", 0, Transform()).replace(child="trailer").child
+        'trailer'
+        """
         parent, child, stamp, row, authority, static = self._fields
-        fields = {
+        fields: Changes = {
             "parent": parent,
             "child": child,
             "stamp": stamp,
@@ -126,12 +154,23 @@ class TransformStamped(Sample):
             "authority": authority,
             "static": static,
         }
-        return TransformStamped(**{**fields, **changes})
+        fields.update(changes)
+        return TransformStamped(**fields)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON: ``"type"``, and the parameters under their names; the stamp is an ``int`` of ns."""
+    __replace__ = replace
+
+    def to_dict(self, *, stamps: StampsAs = "int") -> dict[str, Any]:
+        """Plain data for JSON: ``"type"``, and the parameters under their names; the stamp is an ``int`` of ns.
+
+        With ``stamps="text"`` it is text, for programs in JavaScript, whose numbers are not exact beyond 2**53.
+
+        Examples
+        --------
+        >>> TransformStamped("map", "cart", 10, Transform()).to_dict(stamps="text")["stamp"]
+        '10'
+        """
         parent, child, stamp, row, authority, static = self._fields
-        return {
+        values = {
             "type": "TransformStamped",
             "parent": parent,
             "child": child,
@@ -140,17 +179,29 @@ class TransformStamped(Sample):
             "authority": authority,
             "static": static,
         }
+        return values if stamps == "int" else with_text(values, stamps)
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "TransformStamped":
+    def __get_pydantic_core_schema__(cls, _source: Any, handler: Any) -> Any:
+        defaults = {"type": None, "authority": "", "static": False, **dict.fromkeys(_POLICY_KINDS)}
+        return schema_of(TransformStamped, {**_KINDS, **_POLICY_KINDS}, defaults, handler)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> TransformStamped:
         """The sample or answer from which `to_dict` made `data`.
 
         Raises
         ------
         ValueError
             If the data do not describe a `TransformStamped`. The message names the field.
+
+        Examples
+        --------
+        >>> sample = TransformStamped("map", "cart", 10, Transform())
+        >>> TransformStamped.from_dict(sample.to_dict()) == sample
+        True
         """
-        kinds = _KINDS if "gap" not in data else {**_KINDS, "extrapolated_by": int, "gap": int}
+        kinds = _KINDS if "gap" not in data else {**_KINDS, **_POLICY_KINDS}
         fields = from_fields(TransformStamped, data, kinds)
         policy_use = fields.pop("extrapolated_by", None), fields.pop("gap", None)
         target, source = fields["parent"], fields["child"]
@@ -163,15 +214,15 @@ class TransformStamped(Sample):
         _, _, stamp, row, _, static = answer._fields
         return qualified_answer(target, source, stamp, row, static, *policy_use)
 
-    def inverse(self) -> "TransformStamped":
+    def inverse(self) -> TransformStamped:
         """The transform in the other direction, with the names of the two frames exchanged; also as ``~t``."""
         parent, child, stamp, row, _, static = self._fields
         return answer_of(child, parent, stamp, invert_row(row), static)
 
-    def __invert__(self) -> "TransformStamped":
+    def __invert__(self) -> TransformStamped:
         return self.inverse()
 
-    def __matmul__(self, other: "TransformStamped") -> "TransformStamped":
+    def __matmul__(self, other: TransformStamped) -> TransformStamped:
         """Compose two transforms whose frames meet: ``map_from_base @ base_from_laser``.
 
         Raises
@@ -236,9 +287,9 @@ class QualifiedTransform(TransformStamped):
         """The time in ns between two samples that were interpolated, on the edge where it is longest."""
         return self._policy_use[1]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self, *, stamps: StampsAs = "int") -> dict[str, Any]:
         """As `TransformStamped.to_dict`, with ``"extrapolated_by"`` and ``"gap"`` in ns."""
-        return {**super().to_dict(), "extrapolated_by": self.extrapolated_by, "gap": self.gap}
+        return {**super().to_dict(stamps=stamps), "extrapolated_by": self.extrapolated_by, "gap": self.gap}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (type(self), self._fields, self._policy_use), getattr(self, "__dict__", None)

@@ -8,16 +8,18 @@ conversion start sooner without it.
 A transform holds one tuple of seven floats, a row; `tfbus.rows` has the arithmetic.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, overload
+from typing import Any, TypedDict, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from tfbus import _python_kernel
 from tfbus.errors import InvalidTransformError
-from tfbus.plain import from_fields
+from tfbus.plain import from_fields, schema_of
 from tfbus.rows import (
     IDENTITY,
     NORM_TOLERANCE,
@@ -34,6 +36,15 @@ from tfbus.rows import (
 )
 from tfbus.stamps import as_array
 from tfbus.which_kernel import compose_rows, fill_matrix, invert_row, move_point, move_points, row_of_matrix
+
+_KINDS = {"translation": Vector, "rotation": Quaternion}
+
+
+class Changes(TypedDict, total=False):
+    """The fields of a `Transform`, as `copy.replace` takes them."""
+
+    translation: Numbers
+    rotation: Numbers
 
 
 class Transform:
@@ -59,6 +70,7 @@ class Transform:
     """
 
     __slots__ = ("_row",)
+    __match_args__ = ("translation", "rotation")
     _row: Row
 
     def __init__(
@@ -79,18 +91,30 @@ class Transform:
         self._row = (*as_vector(translation, "translation"), *as_rotation(rotation, "rotation"))
 
     @classmethod
-    def identity(cls) -> "Transform":
-        """The transform that changes nothing."""
+    def identity(cls) -> Transform:
+        """The transform that changes nothing.
+
+        Examples
+        --------
+        >>> Transform.identity() @ Transform((1.0, 0.0, 0.0))
+        Transform(translation=(1.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0, 1.0))
+        """
         return from_row(IDENTITY)
 
     @classmethod
-    def from_wxyz(cls, translation: Numbers, wxyz: Numbers) -> "Transform":
-        """From a translation in m and a unit quaternion in transforms3d's order, (w, x, y, z)."""
+    def from_wxyz(cls, translation: Numbers, wxyz: Numbers) -> Transform:
+        """From a translation in m and a unit quaternion in transforms3d's order, (w, x, y, z).
+
+        Examples
+        --------
+        >>> Transform.from_wxyz((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)).rotation
+        (0.0, 0.0, 0.0, 1.0)
+        """
         w, x, y, z = as_floats(wxyz, 4, "rotation")
         return cls(translation, (x, y, z, w))
 
     @classmethod
-    def from_matrix(cls, matrix: npt.ArrayLike) -> "Transform":
+    def from_matrix(cls, matrix: npt.ArrayLike) -> Transform:
         """From a homogeneous matrix of shape (4, 4).
 
         The quaternion has w >= 0. If the rotation part is within 1 % of a rotation, it is projected on the nearest one
@@ -101,6 +125,11 @@ class Transform:
         InvalidTransformError
             If the shape is not (4, 4), a number is not finite, the last row is not (0, 0, 0, 1), or the rotation part
             is not a rotation.
+
+        Examples
+        --------
+        >>> Transform.from_matrix(np.eye(4)) == Transform.identity()
+        True
         """
         m = as_array(matrix, "matrix", np.float64)
         row = row_of_matrix(m)
@@ -122,7 +151,7 @@ class Transform:
         return cls.from_wxyz(m[:3, 3], mat2quat(r))
 
     @classmethod
-    def from_xyz_rpy(cls, xyz: Numbers, rpy: Numbers, *, degrees: bool = False) -> "Transform":
+    def from_xyz_rpy(cls, xyz: Numbers, rpy: Numbers, *, degrees: bool = False) -> Transform:
         """From a translation in m and roll, pitch, yaw about the fixed axes x, y, z, as in URDF.
 
         Parameters
@@ -154,7 +183,7 @@ class Transform:
     @classmethod
     def from_euler(
         cls, sequence: str, angles: Numbers, translation: Numbers = (0.0, 0.0, 0.0), *, degrees: bool = False
-    ) -> "Transform":
+    ) -> Transform:
         """From three rotations about axes, one after another, and a translation in m.
 
         Parameters
@@ -197,8 +226,15 @@ class Transform:
         return cls.from_wxyz(translation, wxyz)
 
     @classmethod
-    def from_axis_angle(cls, axis: Numbers, angle: float, translation: Numbers = (0.0, 0.0, 0.0)) -> "Transform":
-        """From a rotation by `angle` (rad) about `axis` (any length but zero), and a translation in m."""
+    def from_axis_angle(cls, axis: Numbers, angle: float, translation: Numbers = (0.0, 0.0, 0.0)) -> Transform:
+        """From a rotation by `angle` (rad) about `axis` (any length but zero), and a translation in m.
+
+        Examples
+        --------
+        >>> turn = Transform.from_axis_angle((0.0, 0.0, 1.0), np.pi / 2)
+        >>> turn.is_close(Transform.from_xyz_rpy((0.0, 0.0, 0.0), (0.0, 0.0, 90.0), degrees=True))
+        True
+        """
         from transforms3d.quaternions import axangle2quat
 
         x, y, z = as_floats(axis, 3, "axis")
@@ -210,14 +246,29 @@ class Transform:
         return cls.from_wxyz(translation, axangle2quat((x / length, y / length, z / length), angle, True))
 
     @classmethod
-    def from_scipy(cls, translation: Numbers, rotation: Any) -> "Transform":
+    def from_scipy(cls, translation: Numbers, rotation: Any) -> Transform:
         """From a translation in m and one ``scipy.spatial.transform.Rotation``."""
         return cls(translation, rotation.as_quat())
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Transform":
-        """The transform from which `to_dict` made `data`; `ValueError` if the data are not a transform."""
-        return cls(**from_fields(cls, data, {"translation": Vector, "rotation": Quaternion}))
+    def from_dict(cls, data: Mapping[str, Any]) -> Transform:
+        """The transform from which `to_dict` made `data`; `ValueError` if the data are not a transform.
+
+        Examples
+        --------
+        >>> Transform.from_dict({"translation": [1, 2, 3], "rotation": [0, 0, 0, 1]}).translation
+        (1.0, 2.0, 3.0)
+        """
+        return cls(**from_fields(cls, data, _KINDS))
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _source: Any, handler: Any) -> Any:
+        return schema_of(Transform, _KINDS, {"type": None}, handler)
+
+    def __replace__(self, **changes: Unpack[Changes]) -> Transform:
+        fields: Changes = {"translation": self.translation, "rotation": self.rotation}
+        fields.update(changes)
+        return Transform(**fields)
 
     @property
     def translation(self) -> Vector:
@@ -230,7 +281,13 @@ class Transform:
         return self._row[3:]
 
     def as_wxyz(self) -> Quaternion:
-        """The rotation in transforms3d's order, (w, x, y, z)."""
+        """The rotation in transforms3d's order, (w, x, y, z).
+
+        Examples
+        --------
+        >>> Transform().as_wxyz()
+        (1.0, 0.0, 0.0, 0.0)
+        """
         return self._row[6], *self._row[3:6]
 
     def as_rpy(self) -> Vector:
@@ -239,6 +296,11 @@ class Transform:
         Sum and difference of roll and yaw are computed from the quaternion (Bernardes and Viollet, "Quaternion to
         Euler angles conversion", PLoS ONE 17(11), 2022): computed from a matrix, as in transforms3d, they are
         wrong by up to half a rad within 1e-8 rad of that pitch.
+
+        Examples
+        --------
+        >>> Transform().as_rpy()
+        (0.0, 0.0, 0.0)
         """
         x, y, z, w = self.rotation
         low, high = math.hypot(x + z, w - y), math.hypot(x - z, w + y)
@@ -255,6 +317,11 @@ class Transform:
         """Unit axis and angle in rad, from 0 to pi; the axis of no rotation is (1, 0, 0).
 
         The angle comes from ``atan2``: ``acos``, which transforms3d uses, loses half the digits near the identity.
+
+        Examples
+        --------
+        >>> Transform((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)).as_axis_angle()
+        ((0.0, 0.0, 1.0), 3.141592653589793)
         """
         x, y, z, w = self.rotation
         sine = math.hypot(x, y, z)
@@ -276,18 +343,36 @@ class Transform:
         return Rotation.from_quat(self.rotation)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON: ``"translation"`` [x, y, z] in m and ``"rotation"`` [x, y, z, w]."""
+        """Plain data for JSON: ``"translation"`` [x, y, z] in m and ``"rotation"`` [x, y, z, w].
+
+        Examples
+        --------
+        >>> Transform((1.0, 2.0, 3.0)).to_dict()
+        {'translation': [1.0, 2.0, 3.0], 'rotation': [0.0, 0.0, 0.0, 1.0]}
+        """
         return {"translation": list(self.translation), "rotation": list(self.rotation)}
 
     def matrix(self) -> npt.NDArray[np.float64]:
-        """A new homogeneous matrix of shape (4, 4)."""
+        """A new homogeneous matrix of shape (4, 4).
+
+        Examples
+        --------
+        >>> Transform((1.0, 2.0, 3.0)).matrix()[:3, 3]
+        array([1., 2., 3.])
+        """
         return fill_matrix(self._row, np.empty((4, 4)))
 
-    def inverse(self) -> "Transform":
-        """The transform that undoes this one."""
+    def inverse(self) -> Transform:
+        """The transform that undoes this one.
+
+        Examples
+        --------
+        >>> Transform((1.0, 2.0, 3.0)).inverse().translation
+        (-1.0, -2.0, -3.0)
+        """
         return from_row(invert_row(self._row))
 
-    def __matmul__(self, other: "Transform") -> "Transform":
+    def __matmul__(self, other: Transform) -> Transform:
         if not isinstance(other, Transform):
             return NotImplemented
         return from_row(compose_rows(self._row, other._row))
@@ -312,6 +397,12 @@ class Transform:
         ------
         ValueError
             If the shape does not end in 3. The message has the shape.
+
+        Examples
+        --------
+        >>> Transform((1.0, 0.0, 0.0)).apply(np.zeros((2, 3)))
+        array([[1., 0., 0.],
+               [1., 0., 0.]])
         """
         moved = move_point(self._row, points)
         if moved is not None:
@@ -335,20 +426,25 @@ class Transform:
             _python_kernel.move_points(self._row, points, out)
         return out
 
-    def interpolate(self, other: "Transform", fraction: float) -> "Transform":
+    def interpolate(self, other: Transform, fraction: float) -> Transform:
         """The transform a `fraction` of the way to `other`: translation linear, rotation along the shorter arc.
 
         Raises
         ------
         ValueError
             If `fraction` is not from 0 to 1: nothing here extrapolates by itself.
+
+        Examples
+        --------
+        >>> Transform().interpolate(Transform((1.0, 0.0, 0.0)), 0.25).translation
+        (0.25, 0.0, 0.0)
         """
         if not 0.0 <= fraction <= 1.0:
             raise ValueError(f"fraction must be from 0 to 1, got {fraction!r}")
         return from_row(interpolate(self._row, other._row, float(fraction)))
 
     def is_close(
-        self, other: "Transform", *, translation_tolerance: float = 1e-9, rotation_tolerance: float = 1e-9
+        self, other: Transform, *, translation_tolerance: float = 1e-9, rotation_tolerance: float = 1e-9
     ) -> bool:
         """Whether the transforms are equal within tolerances; quaternions are compared up to their sign.
 
@@ -358,6 +454,11 @@ class Transform:
             Greatest distance in m.
         rotation_tolerance : float
             Greatest angle between the rotations in rad.
+
+        Examples
+        --------
+        >>> Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)).is_close(Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, -1.0)))
+        True
         """
         if math.dist(self.translation, other.translation) > translation_tolerance:
             return False

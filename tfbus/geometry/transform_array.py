@@ -4,6 +4,8 @@ It holds seven columns, ``tx, ty, tz, qx, qy, qz, qw``, each an array over the t
 `tfbus.rows` take columns as well as the seven floats of a row, so each formula is written once.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from importlib import import_module
@@ -12,7 +14,7 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.errors import InvalidTransformError
+from tfbus.errors import InvalidTransformError, pip_install
 from tfbus.geometry.transform import Transform, from_row
 from tfbus.rows import NORM_TOLERANCE, ROUNDING, Columns, compose, invert, rotate
 from tfbus.stamps import StampLike, StampsLike, as_array, as_stamp, as_stamps, format_stamp
@@ -123,7 +125,7 @@ class TransformArray:
     @classmethod
     def from_scipy(
         cls, translations: npt.ArrayLike, rotations: Any, stamps: StampsLike | None = None
-    ) -> "TransformArray":
+    ) -> TransformArray:
         """From translations in m, shape (n, 3), and n rotations in a ``scipy.spatial.transform.Rotation``."""
         return cls(translations, rotations.as_quat(), stamps)
 
@@ -183,11 +185,23 @@ class TransformArray:
         return None if self._policy_use is None else self._policy_use[1]
 
     def as_wxyz(self) -> Floats:
-        """The rotations in transforms3d's order, (w, x, y, z): a new array of shape (n, 4)."""
+        """The rotations in transforms3d's order, (w, x, y, z): a new array of shape (n, 4).
+
+        Examples
+        --------
+        >>> TransformArray([(1.0, 2.0, 3.0)], [(0.0, 0.0, 0.0, 1.0)]).as_wxyz()
+        array([[1., 0., 0., 0.]])
+        """
         return np.ascontiguousarray(self._columns[[6, 3, 4, 5]].T)
 
     def as_rpy(self) -> Floats:
-        """Roll, pitch, yaw of each in rad, as `Transform.as_rpy` gives them: a new array of shape (n, 3)."""
+        """Roll, pitch, yaw of each in rad, as `Transform.as_rpy` gives them: a new array of shape (n, 3).
+
+        Examples
+        --------
+        >>> TransformArray([(1.0, 2.0, 3.0)], [(0.0, 0.0, 0.0, 1.0)]).as_rpy()
+        array([[0., 0., 0.]])
+        """
         x, y, z, w = self._columns[3:]
         # Their squares add up to two, so at most one of them is near zero.
         low, high = np.hypot(x + z, w - y), np.hypot(x - z, w + y)
@@ -245,7 +259,10 @@ class TransformArray:
         stamps = self._stamps
         if index is not None and stamps is None:
             raise ValueError("these transforms have no stamps for an index")
-        frames = import_module(library)
+        try:
+            frames = import_module(library)
+        except ImportError as error:
+            raise ImportError(f"a data frame needs one more package: {pip_install(library)} ({error})") from error
         columns: dict[str, Any] = dict(zip(COLUMN_NAMES, self._columns, strict=True))
         if angles:
             columns |= zip(("roll_rad", "pitch_rad", "yaw_rad"), self.as_rpy().T, strict=True)
@@ -262,7 +279,13 @@ class TransformArray:
         return frames.DataFrame(columns, dates, copy=True)
 
     def matrices(self) -> Floats:
-        """New homogeneous matrices of shape (n, 4, 4)."""
+        """New homogeneous matrices of shape (n, 4, 4).
+
+        Examples
+        --------
+        >>> TransformArray([(1.0, 2.0, 3.0)], [(0.0, 0.0, 0.0, 1.0)]).matrices().shape
+        (1, 4, 4)
+        """
         matrices = np.zeros((len(self), 4, 4))
         rotation = (*self._columns[3:],)
         for axis, unit in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
@@ -287,6 +310,13 @@ class TransformArray:
         ------
         ValueError
             If the shape is another. The message has the shape.
+
+        Examples
+        --------
+        >>> two = TransformArray([(1.0, 0.0, 0.0), (2.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 1.0)] * 2)
+        >>> two.apply(np.zeros((2, 3)))
+        array([[1., 0., 0.],
+               [2., 0., 0.]])
         """
         array = as_array(points, "points")
         if array.shape != (len(self), 3):
@@ -297,11 +327,17 @@ class TransformArray:
             moved.T[:] = move((*self._columns,), *array.T.astype(np.float64))
         return moved
 
-    def inverse(self) -> "TransformArray":
-        """The inverse of each transform at the same stamp, without `extrapolated_by` and `gap`."""
+    def inverse(self) -> TransformArray:
+        """The inverse of each transform at the same stamp, without `extrapolated_by` and `gap`.
+
+        Examples
+        --------
+        >>> TransformArray([(1.0, 2.0, 3.0)], [(0.0, 0.0, 0.0, 1.0)]).inverse().translations
+        array([[-1., -2., -3.]])
+        """
         return from_columns(np.stack(invert((*self._columns,))), stamps=self._stamps)
 
-    def __matmul__(self, other: "TransformArray | Transform") -> "TransformArray":
+    def __matmul__(self, other: TransformArray | Transform) -> TransformArray:
         """Compose with `other` one by one, or all with the same transform, without `extrapolated_by` and `gap`.
 
         If only one operand has stamps, the product has them. If both have stamps that differ, it has none.
@@ -314,13 +350,13 @@ class TransformArray:
             stamps = other._stamps if stamps is None or np.array_equal(stamps, other._stamps) else None
         return from_columns(np.stack(compose((*self._columns,), columns)), stamps=stamps)
 
-    def __rmatmul__(self, other: Transform) -> "TransformArray":
+    def __rmatmul__(self, other: Transform) -> TransformArray:
         columns = _columns_of(other, len(self))
         if columns is None:
             return NotImplemented
         return from_columns(np.stack(compose(columns, (*self._columns,))), stamps=self._stamps)
 
-    def between(self, start: StampLike | None = None, stop: StampLike | None = None) -> "TransformArray":
+    def between(self, start: StampLike | None = None, stop: StampLike | None = None) -> TransformArray:
         """The transforms from one stamp to another.
 
         Parameters
@@ -356,8 +392,8 @@ class TransformArray:
     @overload
     def __getitem__(self, index: int | np.integer[Any]) -> Transform: ...
     @overload
-    def __getitem__(self, index: slice | list[int] | list[bool] | npt.NDArray[Any]) -> "TransformArray": ...
-    def __getitem__(self, index: Any) -> "Transform | TransformArray":
+    def __getitem__(self, index: slice | list[int] | list[bool] | npt.NDArray[Any]) -> TransformArray: ...
+    def __getitem__(self, index: Any) -> Transform | TransformArray:
         """One transform, or those selected by a slice, a mask or indices in a list or an array.
 
         Raises

@@ -132,10 +132,10 @@ class DomainEnd(Endpoint):
         self._channels = Channels(wire, self.relay.origin, self.frames is not None, slow_rate, self.report)
         self._places = Places(self.max_frames)
         self._replicas: dict[str, Replica] = {}
-        self.own = self._replica_of(self._robot)
+        self.own: Replica = self._replica_of(self._robot)
         self._agreement = Agreement()
         self._history = HistoryAsker(history or 0.0, wire.send, now)
-        self.lookups = RemoteLookups(wire.send, name)
+        self.lookups: RemoteLookups = RemoteLookups(wire.send, name)
         # The last sign of each peer that agrees with this link: the same sign once more need not wake the event loop.
         self._resting: dict[str, bytes] = {}
         # Answering takes half of the event loop's time at most.

@@ -16,7 +16,7 @@ from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import OnceLogger, SeenKeys
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import REMEMBERED_REASONS, Entry, Outbox, Peer, RemovedFrame, Turn, relay_of
+from tfbus.links.relay import REMEMBERED_REASONS, Entry, Outbox, Peer, Relay, RemovedFrame, Turn, relay_of
 from tfbus.links.seams import Carrier, Joined, Left, Received, SendReport, Wire
 from tfbus.tf_message import MalformedMessageError
 
@@ -104,24 +104,24 @@ class Endpoint(Outbox, ABC):
         super().__init__(frames)
         self.bus = bus
         self.name = name
-        self.id = network.id
+        self.id: str = network.id
         self._network = network
         self.drop_lost = drop_lost
         self.max_frames = max_frames
         self.follower: HearsTime | None = None
         self._followed: str | None = None
         self._log = OnceLogger(logging.getLogger("tfbus"))
-        self.relay = relay_of(bus)
+        self.relay: Relay = relay_of(bus)
         self.peers: dict[str, Peer] = {}
         self.rejected: Counter[str] = Counter()
         self._reported_of_unknown = SeenKeys(REMEMBERED_REASONS)
         self.time: int | None = None
         self._time_waits = False
-        self.report = SendReport(self._warn_not_sent)
+        self.report: SendReport = SendReport(self._warn_not_sent)
         self.messages = 0
-        self.samples = 0
+        self.samples: int = 0
         self.lost = 0
-        self.duplicates = 0
+        self.duplicates: int = 0
 
     # For the link
 
@@ -165,7 +165,8 @@ class Endpoint(Outbox, ABC):
     def send(self) -> None:
         """Hand the gathered entries to the network, if there are any."""
         turn = Turn(self._entries, self._take_statics(), self.time if self._time_waits else None)
-        self._entries, self.pending, self._time_waits = [], 0, False
+        self._entries, self._time_waits = [], False
+        self.pending: int = 0
         if turn.entries or turn.statics or turn.time is not None:
             self._send(turn)
 

@@ -97,9 +97,9 @@ class FoxgloveServer(AsyncOnly):
         if not 0 <= port <= 65_535:
             raise ValueError(f"a port must be from 0 to 65535, got {port}")
         self.bus = bus
-        self.address = ""
-        self.sent = 0
-        self.not_sent = 0
+        self.address: str = ""
+        self.sent: int = 0
+        self.not_sent: int = 0
         self._host, self._port, self._topic = host, port, topic
         self._door = WebDoor(host, origins)
         self._connections = 0

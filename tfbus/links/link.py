@@ -237,7 +237,7 @@ class Link(AsyncOnly):
         check_capacity(capacity)
         check_capacity(end.max_frames, "max_frames")
         self.bus = bus
-        self.id = end.id
+        self.id: str = end.id
         self._end = end
         end.host = self
         end.follower = ClockFollower(clock) if isinstance(clock, SimulatedClock) else clock
@@ -267,7 +267,15 @@ class Link(AsyncOnly):
         return f"<{type(self).__name__} {self._end.name!r}: {state}>"
 
     def statistics(self) -> LinkStatistics:
-        """All counters, as they are now."""
+        """All counters, as they are now.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> async with LocalLink(Bus(), directory=tempfile.mkdtemp()) as link:
+        ...     print(link.statistics().peers)
+        0
+        """
         end = self._end
         return LinkStatistics(
             peers=len(end.present),
@@ -505,8 +513,8 @@ class DomainLink(Link):
         tell_clock: bool = False,
         **options: Unpack[EndOptions],
     ) -> None:
-        self.domain = check_domain(domain)
-        self.robot = options.get("robot")
+        self.domain: str = check_domain(domain)
+        self.robot: str | None = options.get("robot")
         self._domain_end = DomainEnd(bus, domain, wire, **options)
         super().__init__(self._domain_end, capacity=capacity, clock=clock, tell_clock=tell_clock)
 

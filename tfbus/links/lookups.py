@@ -262,6 +262,16 @@ class BufferServer(AsyncOnly):
     Notes
     -----
     Where one robot has several servers, one of them answers. Anyone who can reach the link can ask it.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from tfbus.links import BufferServer
+    >>> bus = Bus()
+    >>> async with LocalLink(bus, directory=tempfile.mkdtemp()) as link:
+    ...     async with BufferServer(Buffer(bus), link) as server:
+    ...         print(server.statistics().answered)
+    0
     """
 
     def __init__(self, buffer: Buffer, link: Serving, *, capacity: int = 1_000, rate: float = 10_000.0) -> None:

@@ -140,8 +140,8 @@ class Outbox:
     """Whether the other ends see for themselves that the owner of a frame was lost."""
 
     def __init__(self, frames: Iterable[str] | None) -> None:
-        self.frames = None if frames is None else frozenset(frames)
-        self.pending = 0
+        self.frames: frozenset[str] | None = None if frames is None else frozenset(frames)
+        self.pending: int = 0
         self._entries: list[Entry] = []
 
     def add(self, published: Entry, echo: bool = False, withdrawn: bool = False) -> None:
@@ -318,7 +318,7 @@ class Relay:
     """
 
     def __init__(self, bus: Bus) -> None:
-        self.origin = os.urandom(16)
+        self.origin: bytes = os.urandom(16)
         self._number = 0
         self._bus = bus
         self._registration: Registration | None = None

@@ -213,8 +213,8 @@ class SendReport:
 
     def __init__(self, warn: Callable[[Exception], object]) -> None:
         self._warn = warn
-        self.messages = 0
-        self.samples = 0
+        self.messages: int = 0
+        self.samples: int = 0
         self.not_sent: Counter[str] = Counter()
 
     def sent(self, samples: int) -> None:

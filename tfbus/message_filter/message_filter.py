@@ -95,7 +95,7 @@ class DroppedMessages(Generic[MessageT]):
         self._on_drop = on_drop
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self.counts: Counter[DropReason] = Counter()
-        self.callbacks_failed = 0
+        self.callbacks_failed: int = 0
 
     def drop(self, message: MessageT, reason: DropReason, error: TransformError | None) -> None:
         """Count a message and call the callback; its first `Exception` is logged."""
@@ -144,12 +144,12 @@ class PendingMessage(Generic[MessageT, AnswerT]):
     __slots__ = ("answer", "frame", "message", "number", "place", "stamp", "wait")
 
     def __init__(self, message: MessageT, frame: str, stamp: int | Latest) -> None:
-        self.message = message
-        self.frame = frame
-        self.stamp = stamp
+        self.message: MessageT = message
+        self.frame: str = frame
+        self.stamp: int | Latest = stamp
         self.answer: AnswerT | None = None
         self.wait: Wait | None = None
-        self.number = -1
+        self.number: int = -1
         self.place: tuple[int, int] | None = None
 
 
@@ -175,7 +175,7 @@ class MessageQueue(Generic[MessageT, AnswerT]):
             raise ValueError(f"order must be 'ready', 'stamp' or 'arrival', not {order!r}")
         self.capacity = capacity
         self.order: Order = order
-        self.unanswered = 0
+        self.unanswered: int = 0
         self._arrivals = count()
         self._pending: dict[int, PendingMessage[MessageT, AnswerT]] = {}
         # The places in the order of delivery; with "ready", only the places of answered messages.
@@ -287,7 +287,7 @@ class Targets(Generic[AnswerT]):
 
     def __init__(self, buffer: Buffer, target: str | Sequence[str], tolerance: float) -> None:
         self._buffer = buffer
-        self.one = isinstance(target, str)
+        self.one: bool = isinstance(target, str)
         self._tolerance = from_seconds(as_duration(tolerance, "margin"))
         self.replace(target)
 
@@ -405,6 +405,19 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
     An error of the source, or of `frame` and `stamp`, is raised unchanged by the iteration, after the ready messages;
     if nobody reads on, by the end of the ``async with``, unless that is left by another exception. An exception that is
     no `Exception`, such as Ctrl-C, stops the body at once, and is raised unchanged by the ``async with``.
+
+    Examples
+    --------
+    >>> from collections.abc import AsyncIterator
+    >>> async def points() -> AsyncIterator[PointStamped]:
+    ...     yield PointStamped("laser", 0, (1.0, 0.0, 0.0))
+    >>> bus = Bus(SimulatedClock())
+    >>> TransformBroadcaster(bus).send_static("base_link", "laser", Transform((0.1, 0.0, 0.2)))
+    >>> with Buffer(bus) as buffer:
+    ...     async with MessageFilter(points(), buffer, target="base_link") as pairs:
+    ...         async for point, transform in pairs:
+    ...             print(point.frame, transform.parent)
+    laser base_link
     """
 
     @overload

@@ -69,6 +69,15 @@ class Edits:
     ------
     ValueError
         If a new name is empty, or a new name or the prefix starts with a slash.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from tfbus.recording import Edits, convert, load
+    >>> path = tempfile.mkdtemp() + "/run.mcap"
+    >>> _ = convert(["small.bag"], path, edits=Edits(rename={"base_link": "base"}))
+    >>> "base" in load(path)
+    True
     """
 
     frames: Collection[str] | None = None
@@ -142,6 +151,13 @@ class Conversion:
         The first losses, in words.
     statics : dict of str to StaticTransform
         The last static transform of each child frame, with its new names.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from tfbus.recording import convert
+    >>> convert(["small.bag"], tempfile.mkdtemp() + "/run.mcap").messages
+    789
     """
 
     messages: int = 0
@@ -211,6 +227,13 @@ def convert(
         If the output exists already.
     OSError
         If it cannot be written; then there is no output, and an existing file stays as it was.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from tfbus.recording import convert
+    >>> convert(["small.bag"], tempfile.mkdtemp() + "/run.mcap", until=from_seconds(100.0)).transforms
+    4
     """
     target = Path(output)
     make = _COPIES.get(target.suffix)

@@ -38,6 +38,13 @@ def examine(
     -------
     list of Finding
         Empty if nothing is wrong.
+
+    Examples
+    --------
+    >>> from tfbus.recording import examine, open_recording
+    >>> with open_recording("small.bag") as recording:
+    ...     print(sorted({finding.kind for finding in examine(recording)}))
+    ['disconnected', 'gap', 'refused', 'rotation', 'stamps go back', 'two parents']
     """
     examiner = Examiner(limits)
     unfinished: list[Finding] = []

@@ -13,13 +13,21 @@ from tfbus.recording.formats.copies import MessageTypes, types_with_header
 from tfbus.recording.formats.storage import Channel, UnfoldError
 from tfbus.recording.formats.transforms import decompressed
 from tfbus.recording.recording import open_storage
-from tfbus.stamps import SECOND
+from tfbus.stamps import SECOND, format_stamp
+from tfbus.tree.rendering import counted
 
 _HEADER_TYPES = ("Header", "std_msgs/Header", "std_msgs/msg/Header")
 
 
 class HeaderStamps(NamedTuple):
-    """The stamps of the messages on a topic."""
+    """The stamps of the messages on a topic.
+
+    Examples
+    --------
+    >>> from tfbus.recording import HeaderStamps
+    >>> HeaderStamps(np.array([0, SECOND]), from_headers=True, unreadable=0)
+    <HeaderStamps of 2 messages, 0.000 s .. 1.000 s, from headers>
+    """
 
     stamps: npt.NDArray[np.int64]
     """ns, in the order of the log times."""
@@ -27,6 +35,14 @@ class HeaderStamps(NamedTuple):
     """Whether the stamps are from headers. If not, the messages have no header, and the stamps are their log times."""
     unreadable: int
     """The number of messages that are too short, and of damaged places of the file; both are left out."""
+
+    def __repr__(self) -> str:
+        origin = "headers" if self.from_headers else "log times"
+        span = (
+            f", {format_stamp(int(self.stamps[0]))} .. {format_stamp(int(self.stamps[-1]))}" if len(self.stamps) else ""
+        )
+        unreadable = f", {self.unreadable:,} unreadable" if self.unreadable else ""
+        return f"<HeaderStamps of {counted(len(self.stamps), 'message')}{span}, from {origin}{unreadable}>"
 
 
 def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
@@ -42,6 +58,12 @@ def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
     ------
     RecordingError
         If the recording cannot be read, or nothing is on the topic.
+
+    Examples
+    --------
+    >>> from tfbus.recording import header_stamps
+    >>> header_stamps("small.bag", "/tf")
+    <HeaderStamps of 786 messages, 100.002 s .. 109.982 s, from log times>
     """
     name = topic.removeprefix("/")
     stamps: list[int] = []

@@ -158,6 +158,14 @@ class Player:
     ------
     TypeError, ValueError
         If `rate` is not greater than zero, `until` is before `since`, or the topics are wrong.
+
+    Examples
+    --------
+    >>> from tfbus.recording import Player
+    >>> bus = Bus(SimulatedClock())
+    >>> await Player(bus, "small.bag", rate=1000.0).play()
+    >>> bus.statistics().samples > 900
+    True
     """
 
     def __init__(
@@ -182,15 +190,15 @@ class Player:
         if self._since is not None and self._until is not None and self._until < self._since:
             raise ValueError(f"the range must not end before it begins, at {since}, got {until}")
         self.bus = bus
-        self.path = os.fspath(path)
+        self.path: str = os.fspath(path)
         self._rate = float(rate)
         self.loop = loop
         self.start: int | None = None
         self.end: int | None = None
         self.position: int | None = None
-        self.played = 0
-        self.messages = 0
-        self.passes = 0
+        self.played: int = 0
+        self.messages: int = 0
+        self.passes: int = 0
         self.bad: Counter[str] = Counter()
         self._simulated = bus.clock if isinstance(bus.clock, SimulatedClock) else None
         self._playing = False
@@ -218,6 +226,15 @@ class Player:
             If the bus is closed.
         RuntimeError
             If this player is playing already, or another task advances the simulated clock.
+
+        Examples
+        --------
+        >>> from tfbus.recording import Player
+        >>> bus = Bus(SimulatedClock())
+        >>> with Buffer(bus) as buffer:
+        ...     await Player(bus, "small.bag", rate=1000.0, until=from_seconds(101.0)).play()
+        ...     print("gripper" in buffer.tree)
+        True
         """
         if self._playing:
             raise RuntimeError("the recording is being played already")
@@ -237,6 +254,15 @@ class Player:
         """Continue from another log time, in ns; a player that does not play will begin there.
 
         The static transforms from before that time are played first.
+
+        Examples
+        --------
+        >>> from tfbus.recording import Player
+        >>> player = Player(Bus(SimulatedClock()), "small.bag", rate=1000.0)
+        >>> player.seek(from_seconds(109.0))
+        >>> await player.play()
+        >>> player.messages < 100
+        True
         """
         self._seek_target = as_stamp(stamp)
         self._stir()
@@ -265,7 +291,16 @@ class Player:
         return self._paused
 
     def pause(self) -> None:
-        """Stand still until `resume` or `step`; on a `SimulatedClock`, time stands still as well."""
+        """Stand still until `resume` or `step`; on a `SimulatedClock`, time stands still as well.
+
+        Examples
+        --------
+        >>> from tfbus.recording import Player
+        >>> player = Player(Bus(SimulatedClock()), "small.bag")
+        >>> player.pause()
+        >>> player.paused
+        True
+        """
         if not self._paused:
             self._anchor()
             self._paused = True

@@ -121,13 +121,23 @@ class Recorder(AsyncOnly):
     Leaving waits for the disk, also when the body is cancelled. The log time of a batch is the time of its publication
     on the bus's clock. The format cannot express that a frame was removed, nor that the clock jumped back: programs
     that sort a recording by its log times mix the samples from before the jump with those from after it.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from tfbus.recording import Recorder, load
+    >>> folder, bus = tempfile.mkdtemp(), Bus(SimulatedClock())
+    >>> async with Recorder(bus, f"{folder}/run.mcap"):
+    ...     TransformBroadcaster(bus).send("map", "cart", Transform(), at=0)
+    >>> load(f"{folder}/run.mcap").frames()
+    ['cart', 'map']
     """
 
     def __init__(
         self, bus: Bus, path: str | os.PathLike[str], *, capacity: int = 100_000, overwrite: bool = False
     ) -> None:
         self.bus = bus
-        self.path = os.fspath(path)
+        self.path: str = os.fspath(path)
         self.error: Exception | None = None
         self._overwrite = overwrite
         self._queue = WriteQueue(capacity)
@@ -147,7 +157,19 @@ class Recorder(AsyncOnly):
         return f"<Recorder of {self.path!r}: {self.statistics().samples:,} samples{state}>"
 
     def statistics(self) -> RecorderStatistics:
-        """All counters, as they are now."""
+        """All counters, as they are now.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from tfbus.recording import Recorder
+        >>> bus = Bus(SimulatedClock())
+        >>> async with Recorder(bus, tempfile.mkdtemp() + "/run.mcap") as recorder:
+        ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+        ...     await recorder.flush()
+        ...     print(recorder.statistics().samples)
+        1
+        """
         output = self._output
         samples, messages, unattributed, refused = 0, 0, 0, {}
         if output is not None:
@@ -165,6 +187,15 @@ class Recorder(AsyncOnly):
         """Wait until all samples published so far are in the file, or until the recording has ended.
 
         A program that publishes as fast as it can, such as a simulation, calls this to let the disk keep up.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from tfbus.recording import Recorder, load
+        >>> bus, path = Bus(SimulatedClock()), tempfile.mkdtemp() + "/run.mcap"
+        >>> async with Recorder(bus, path) as recorder:
+        ...     bus.publish(TransformStamped("map", "cart", 0, Transform()))
+        ...     await recorder.flush()
         """
         self._check_entered()
         if self.error is not None or self._ended:

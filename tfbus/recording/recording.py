@@ -46,7 +46,16 @@ from tfbus.tree.tree import TransformTree, forest_of
 
 
 class RecordedMessage(NamedTuple):
-    """The transforms of one message of a recording."""
+    """The transforms of one message of a recording.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording
+    >>> with open_recording("small.bag") as recording:
+    ...     message = next(iter(recording.messages()))
+    >>> format_stamp(message.received)
+    '99.000 s'
+    """
 
     received: int
     """The log time in ns: the time of recording, not a stamp."""
@@ -217,6 +226,13 @@ class RecordedTopic:
         Whether its messages are read as transforms.
     ignored : bool
         Whether it is not read although its name or its type promises transforms.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording
+    >>> with open_recording("small.bag") as recording:
+    ...     print(recording.topics[0].type)
+    tf2_msgs/TFMessage
     """
 
     name: str
@@ -242,11 +258,18 @@ class Recording:
     finished : bool
         Whether its writer finished the file. If not, the last messages may be missing, and a reading of the end reports
         ``"unfinished"``.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording
+    >>> with open_recording("small.bag") as recording:
+    ...     print([topic.name for topic in recording.topics if topic.read])
+    ['/tf', '/tf_static']
     """
 
     def __init__(self, path: Path, storage: Storage, selection: Selection) -> None:
         self.path = path
-        self.finished = storage.finished
+        self.finished: bool = storage.finished
         self._storage: Storage | None = storage
         self._selection = selection
         self._decoders: dict[Channel, ChannelDecoder] = {}
@@ -310,6 +333,13 @@ class Recording:
             If the recording is closed.
         OSError
             If the file can no longer be read.
+
+        Examples
+        --------
+        >>> from tfbus.recording import open_recording
+        >>> with open_recording("small.bag") as recording:
+        ...     print(next(iter(recording.messages())).batch[0].child)
+        laser
         """
         return self._messages(self._opened, since, until)
 
@@ -319,7 +349,15 @@ class Recording:
         yield from map(self._message, storage.messages(self._is_wanted, since, until))
 
     def blocks(self, since: int | None = None, until: int | None = None) -> Iterator[Block | DecodedBlock]:
-        """All messages as `messages` gives them, in blocks that can be decoded at once; for `load` and `summarise`."""
+        """All messages as `messages` gives them, in blocks that can be decoded at once; for `load` and `summarise`.
+
+        Examples
+        --------
+        >>> from tfbus.recording import open_recording
+        >>> with open_recording("small.bag") as recording:
+        ...     print(sum(len(block) for block in recording.blocks()))
+        789
+        """
         storage = self._opened
         columns = ColumnDecoder(self._decoders)
         if since is not None:
@@ -382,7 +420,14 @@ class Recording:
                 raise RecordingError(f"topic {topic!r} {why}{there}", path=str(self.path), reason="no such topic")
 
     def close(self) -> None:
-        """Close the file; closing again does nothing."""
+        """Close the file; closing again does nothing.
+
+        Examples
+        --------
+        >>> from tfbus.recording import open_recording
+        >>> recording = open_recording("small.bag")
+        >>> recording.close()
+        """
         storage, self._storage = self._storage, None
         if storage is not None:
             storage.close()
@@ -453,6 +498,13 @@ def open_recording(
 
     If a writer has left a journal beside an SQLite file, the file is copied to a temporary folder, where SQLite undoes
     the last transaction. If the writer still runs, the original is read.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording
+    >>> with open_recording("small.bag") as recording:
+    ...     print(sum(len(message.batch) for message in recording.messages()))
+    993
     """
     file = Path(path)
     selection = Selection(topics, prefix, namespaces)

@@ -133,8 +133,8 @@ class Periods:
         for column in columns:
             if (column[1:] < column[:-1]).any():
                 column.sort()
-        self.oldest = min((int(column[0]) for column in columns), default=None)
-        self.newest = max((int(column[-1]) for column in columns), default=None)
+        self.oldest: int | None = min((int(column[0]) for column in columns), default=None)
+        self.newest: int | None = max((int(column[-1]) for column in columns), default=None)
         self._durations = Durations()
         self._different = 0
         total = sum(map(len, columns))
@@ -153,7 +153,7 @@ class Periods:
             merged = np.sort(np.concatenate(parts))
             before = self._add(merged[np.append(True, merged[1:] != merged[:-1])] if len(merged) else merged, before)
         maximum = None if self._different < 2 else self._durations.spread()
-        self.longest = None if maximum is None else maximum.max
+        self.longest: float | None = None if maximum is None else maximum.max
 
     def _add(self, stamps: npt.NDArray[np.int64], before: int | None) -> int | None:
         """Count the periods of different stamps that ascend; returns the last stamp."""
@@ -205,6 +205,14 @@ class FrameSummary:
         The times between successive stamps.
     delay : Spread or None
         The times from the stamp of a moving sample to its log time; negative where stamps lie ahead.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording, summarise
+    >>> with open_recording("small.bag") as recording:
+    ...     frames = summarise(recording).frames
+    >>> frames[0].frame, frames[0].parents
+    ('arm', ('base_link',))
     """
 
     frame: str
@@ -245,6 +253,13 @@ class SenderSummary:
         The times between successive stamps of any of its moving samples; None for fewer than two stamps.
     delay : Spread or None
         As `FrameSummary.delay`.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording, summarise
+    >>> with open_recording("small.bag") as recording:
+    ...     print([sender.authority for sender in summarise(recording).senders])
+    ['arm', 'calibration', 'confused', 'description', 'odometry', 'perception', 'slam']
     """
 
     authority: str
@@ -282,6 +297,13 @@ class RecordingSummary:
         As `Recording.remarks`.
     details : tuple of str
         The losses at the first damaged places, in words.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording, summarise
+    >>> with open_recording("small.bag") as recording:
+    ...     print(summarise(recording).problems["not finite"])
+    3
     """
 
     path: Path
@@ -319,6 +341,14 @@ def summarise(
         The messages to read; by default, all messages of the recording, which is faster.
     progress : callable, optional
         Called with the number of messages in each block that has been read.
+
+    Examples
+    --------
+    >>> from tfbus.recording import open_recording, summarise
+    >>> with open_recording("small.bag") as recording:
+    ...     summary = summarise(recording)
+    >>> summary.transforms, summary.roots
+    (992, ('hen', 'island', 'map'))
     """
     counts = _Counts()
     blocks: Iterator[Block | DecodedBlock] = recording.blocks() if messages is None else iter([DecodedBlock(messages)])

@@ -6,6 +6,8 @@ fails at the legacy transmissions of real robots. So it gets one element at a ti
 The XML itself is parsed here, with limits, because files may come from untrusted sources.
 """
 
+from __future__ import annotations
+
 import math
 import os
 from collections import Counter
@@ -32,7 +34,14 @@ KINDS: tuple[JointKind, ...] = get_args(JointKind)
 
 @dataclass(frozen=True, slots=True)
 class Mimic:
-    """A joint follows another: its position is `multiplier` times the position of `joint`, plus `offset` (rad or m)."""
+    """A joint follows another: its position is `multiplier` times the position of `joint`, plus `offset` (rad or m).
+
+    Examples
+    --------
+    >>> finger = Joint("left", "prismatic", "hand", "left_finger", mimic=Mimic("right", multiplier=-1.0))
+    >>> finger.mimic.joint
+    'right'
+    """
 
     joint: str
     multiplier: float = 1.0
@@ -69,6 +78,11 @@ class Joint:
     A planar joint has the coordinates x and y in m and an angle in rad about the axis. URDF does not define the
     directions of x and y. Here they are the child's x and y at position zero, turned by the shortest rotation from z to
     the axis. For the usual axis z, they are simply x and y.
+
+    Examples
+    --------
+    >>> Joint("elbow", "revolute", "upper", "lower", axis=(0.0, 0.0, 1.0), lower=-1.0, upper=1.0).kind
+    'revolute'
     """
 
     name: str
@@ -125,11 +139,22 @@ class Joint:
             has the joint's name.
         TypeError
             If the position has a type that the kind of joint does not accept.
+
+        Examples
+        --------
+        >>> Joint("slide", "prismatic", "rail", "cart", axis=(1.0, 0.0, 0.0)).transform(0.5).translation
+        (0.5, 0.0, 0.0)
         """
         return from_row(self.row(position))
 
     def row(self, position: Position) -> Row:
-        """The row of `transform`; faster for many joints."""
+        """The row of `transform`; faster for many joints.
+
+        Examples
+        --------
+        >>> Joint("slide", "prismatic", "rail", "cart", axis=(1.0, 0.0, 0.0)).row(0.5)
+        (0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+        """
         kind = self.kind
         x, y, z, i, j, k, w = self.origin._row
         if kind == "revolute" or kind == "continuous":
@@ -164,6 +189,11 @@ class Joint:
         ------
         InvalidTransformError, TypeError
             As `transform`.
+
+        Examples
+        --------
+        >>> Joint("slide", "prismatic", "rail", "cart", axis=(1.0, 0.0, 0.0)).number(0.5)
+        0.5
         """
         if type(position) is not float:
             if not isinstance(position, Real):
@@ -475,14 +505,28 @@ def _joint(found: Any, label: str) -> Joint:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A box about its origin, with its length along x, y and z in m."""
+    """A box about its origin, with its length along x, y and z in m.
+
+    Examples
+    --------
+    >>> from tfbus.robot import Box
+    >>> Box((1.0, 2.0, 3.0)).size
+    (1.0, 2.0, 3.0)
+    """
 
     size: Vector
 
 
 @dataclass(frozen=True, slots=True)
 class Cylinder:
-    """A cylinder about its origin, along z; in m."""
+    """A cylinder about its origin, along z; in m.
+
+    Examples
+    --------
+    >>> from tfbus.robot import Cylinder
+    >>> Cylinder(radius=0.1, length=2.0).length
+    2.0
+    """
 
     radius: float
     length: float
@@ -490,14 +534,28 @@ class Cylinder:
 
 @dataclass(frozen=True, slots=True)
 class Sphere:
-    """A sphere about its origin; in m."""
+    """A sphere about its origin; in m.
+
+    Examples
+    --------
+    >>> from tfbus.robot import Sphere
+    >>> Sphere(0.5).radius
+    0.5
+    """
 
     radius: float
 
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """A mesh in a file, as the URDF names it (``package://...``, ``file://...`` or a path), scaled along x, y and z."""
+    """A mesh in a file, as the URDF names it (``package://...``, ``file://...`` or a path), scaled along x, y and z.
+
+    Examples
+    --------
+    >>> from tfbus.robot import Mesh
+    >>> Mesh("package://rig/cart.dae").scale
+    (1.0, 1.0, 1.0)
+    """
 
     filename: str
     scale: Vector = (1.0, 1.0, 1.0)
@@ -519,6 +577,12 @@ class Visual:
         Maps coordinates of the shape into the link.
     colour : (float, float, float, float), optional
         Red, green, blue and opacity from 0 to 1; None if the URDF gives none.
+
+    Examples
+    --------
+    >>> from tfbus.robot import Sphere, Visual
+    >>> Visual("cart", Sphere(0.5), colour=(1.0, 0.0, 0.0, 1.0)).link
+    'cart'
     """
 
     link: str
@@ -545,6 +609,13 @@ def read_visuals(source: str | os.PathLike[str]) -> list[Visual]:
         If the file cannot be read.
     ImportError
         If urdf-parser-py is not installed.
+
+    Examples
+    --------
+    >>> from tfbus.robot import read_visuals
+    >>> ball = '<visual><geometry><sphere radius="0.5"/></geometry></visual>'
+    >>> read_visuals(f'<robot name="rig"><link name="cart">{ball}</link></robot>')[0].shape
+    Sphere(radius=0.5)
     """
     _, elements = read_elements(source)
     colours = {each.value.name: _colour(each.value, each.label) for each in elements if each.tag == "material"}
@@ -591,7 +662,14 @@ def _numbers(values: Any, name: str, label: str) -> list[float]:
 
 @dataclass(frozen=True, slots=True)
 class LimitViolation:
-    """A joint whose position is outside of its limits; in rad or m."""
+    """A joint whose position is outside of its limits; in rad or m.
+
+    Examples
+    --------
+    >>> elbow = Joint("elbow", "revolute", "upper", "lower", lower=-1.0, upper=1.0)
+    >>> RobotModel("arm", ["upper", "lower"], [elbow]).violations({"elbow": 1.5})
+    [LimitViolation(joint='elbow', position=1.5, lower=-1.0, upper=1.0)]
+    """
 
     joint: str
     position: float
@@ -671,7 +749,7 @@ class RobotModel:
         return f"<RobotModel {self.name!r}: {len(self.links)} links below {self.root!r}, {moving} moving joints>"
 
     @classmethod
-    def from_urdf(cls, source: str | os.PathLike[str]) -> "RobotModel":
+    def from_urdf(cls, source: str | os.PathLike[str]) -> RobotModel:
         """Read a URDF file, or its text.
 
         Elements other than links, joints and materials are ignored, such as ``<transmission>`` and ``<gazebo>``. Needs
@@ -691,6 +769,12 @@ class RobotModel:
             If the file cannot be read.
         ImportError
             If urdf-parser-py is not installed.
+
+        Examples
+        --------
+        >>> source = '<robot name="box"><link name="base"/></robot>'
+        >>> RobotModel.from_urdf(source).name
+        'box'
         """
         name, links, joints = read_urdf(source)
         return cls(name, links, joints)
@@ -724,6 +808,13 @@ class RobotModel:
             invalid. The message has the name of the joint.
         TypeError
             If a position has a type that its joint does not accept.
+
+        Examples
+        --------
+        >>> slide = Joint("slide", "prismatic", "rail", "cart", axis=(1.0, 0.0, 0.0))
+        >>> model = RobotModel("rig", ["rail", "cart"], [slide])
+        >>> [sample.transform.translation for sample in model.transforms({"slide": 0.5}, stamp=0)]
+        [(0.5, 0.0, 0.0)]
         """
         return [
             *self.fixed_transforms(stamp, authority, prefix),
@@ -731,7 +822,14 @@ class RobotModel:
         ]
 
     def fixed_transforms(self, stamp: StampLike, authority: str = "", prefix: str = "") -> list[TransformStamped]:
-        """The static samples of `transforms`."""
+        """The static samples of `transforms`.
+
+        Examples
+        --------
+        >>> model = RobotModel("rig", ["base", "laser"], [Joint("mount", "fixed", "base", "laser")])
+        >>> [sample.child for sample in model.fixed_transforms(stamp=0)]
+        ['laser']
+        """
         return [
             TransformStamped(prefix + joint.parent, prefix + joint.child, stamp, joint.origin, authority, static=True)
             for joint in self._fixed
@@ -740,7 +838,15 @@ class RobotModel:
     def moving_transforms(
         self, positions: Mapping[str, Position], stamp: StampLike, authority: str = "", prefix: str = ""
     ) -> list[TransformStamped]:
-        """The moving samples of `transforms`."""
+        """The moving samples of `transforms`.
+
+        Examples
+        --------
+        >>> slide = Joint("slide", "prismatic", "rail", "cart", axis=(1.0, 0.0, 0.0))
+        >>> model = RobotModel("rig", ["rail", "cart"], [slide])
+        >>> [sample.child for sample in model.moving_transforms({"slide": 0.5}, stamp=0)]
+        ['cart']
+        """
         return [
             TransformStamped(
                 prefix + joint.parent, prefix + joint.child, stamp, from_row(joint.row(position)), authority
@@ -755,6 +861,13 @@ class RobotModel:
         ------
         InvalidTransformError, TypeError
             If the position of a mimicked joint is not one finite number.
+
+        Examples
+        --------
+        >>> slide = Joint("slide", "prismatic", "rail", "cart", axis=(1.0, 0.0, 0.0))
+        >>> model = RobotModel("rig", ["rail", "cart"], [slide])
+        >>> [(joint.name, position) for joint, position in model.resolve({"slide": 0.5})]
+        [('slide', 0.5)]
         """
         found: dict[str, Position] = {}
         moving = []
@@ -778,6 +891,12 @@ class RobotModel:
         ------
         InvalidTransformError, TypeError
             As `transforms`.
+
+        Examples
+        --------
+        >>> slide = Joint("slide", "prismatic", "rail", "cart", lower=0.0, upper=1.0)
+        >>> [str(each.joint) for each in RobotModel("rig", ["rail", "cart"], [slide]).violations({"slide": 1.5})]
+        ['slide']
         """
         found = []
         for joint, position in self.resolve(positions):
@@ -790,11 +909,24 @@ class RobotModel:
         return found
 
     def unknown_joints(self, names: Iterable[str]) -> list[str]:
-        """The names that are not names of joints."""
+        """The names that are not names of joints.
+
+        Examples
+        --------
+        >>> RobotModel("rig", ["rail"], []).unknown_joints(["slide"])
+        ['slide']
+        """
         return [name for name in names if name not in self._names]
 
     def zeros(self) -> dict[str, Position]:
-        """The zero position of every moving joint that does not mimic another."""
+        """The zero position of every moving joint that does not mimic another.
+
+        Examples
+        --------
+        >>> slide = Joint("slide", "prismatic", "rail", "cart")
+        >>> RobotModel("rig", ["rail", "cart"], [slide]).zeros()
+        {'slide': 0.0}
+        """
         return {joint.name: joint.zero for joint in self.joints if joint.kind != "fixed" and joint.mimic is None}
 
 

@@ -1,5 +1,7 @@
 """`RobotStatePublisher`, which sends a robot's fixed joints once, and its moving joints with each state."""
 
+from __future__ import annotations
+
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -40,6 +42,15 @@ class RobotStatePublisher:
     ValueError
         If the prefix starts with a slash, or `invalid` has another value.
     BusClosedError, TypeError
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> model = RobotModel("rig", ["rail", "cart"], [Joint("slide", "prismatic", "rail", "cart")])
+    >>> publisher = RobotStatePublisher(bus, model)
+    >>> publisher.publish({"slide": 0.5}, 0)
+    >>> bus.statistics().samples
+    1
     """
 
     def __init__(
@@ -82,6 +93,15 @@ class RobotStatePublisher:
             If a position is not finite, has a wrong length or holds no unit quaternion, the stamp is invalid, or the
             bus refuses a frame. Nothing is sent.
         BusClosedError, TypeError
+
+        Examples
+        --------
+        >>> bus = Bus(SimulatedClock())
+        >>> model = RobotModel("rig", ["rail", "cart"], [Joint("slide", "prismatic", "rail", "cart")])
+        >>> with Buffer(bus) as buffer:
+        ...     RobotStatePublisher(bus, model).publish({"slide": 0.5}, 0)
+        ...     print(buffer.lookup_nowait("rail", "cart").transform.translation)
+        (0.5, 0.0, 0.0)
         """
         stamp = self.bus.clock.now() if stamp is None else stamp
         self.bus.publish(self.model.moving_transforms(positions, stamp, self.authority, self.prefix), self._invalid)
@@ -118,5 +138,14 @@ class RobotStatePublisher:
         self.publish(paired, stamp)
 
     def statistics(self) -> RobotStatistics:
-        """All counters, as they are now."""
+        """All counters, as they are now.
+
+        Examples
+        --------
+        >>> model = RobotModel("rig", ["rail", "cart"], [Joint("slide", "prismatic", "rail", "cart")])
+        >>> publisher = RobotStatePublisher(Bus(SimulatedClock()), model)
+        >>> publisher.publish({"slide": 0.5}, 0)
+        >>> publisher.statistics()
+        RobotStatistics(messages=1)
+        """
         return RobotStatistics(self._messages, self._unknown, dict(self._violations))

@@ -6,6 +6,7 @@ insertions. Formatting an `Explanation` as text needs no lock.
 
 from contextlib import suppress
 from dataclasses import dataclass
+from html import escape
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from tfbus.stamps import LATEST, Latest, format_age, format_duration, format_sta
 from tfbus.tree.forest import AT_A_TIME, Forest, Path
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import At, Bounds, Extrapolation, Policy, find, read_stamp
-from tfbus.tree.rendering import format_rate
+from tfbus.tree.rendering import counted, format_rate
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,13 @@ class ExplainedEdge(PlainData):
         The sender of the newest sample; may be empty.
     error : ExtrapolationError or None
         The reason why this edge blocks the answer.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform(), "odometry"))
+    >>> tree.explain("map", "cart").edges[0].authority
+    'odometry'
     """
 
     parent: str
@@ -60,7 +68,7 @@ class ExplainedEdge(PlainData):
     error: ExtrapolationError | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Explanation(PlainData):
     """The path and the samples behind an answer, or the errors that block it. ``str`` gives a text of several lines.
 
@@ -82,6 +90,13 @@ class Explanation(PlainData):
         One for each two neighbours in the chain, in its order; or in the two half chains, target's first.
     errors : tuple of TransformLookupError
         All errors that block the answer, among them the error that a lookup raises.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform()))
+    >>> tree.explain("map", "cart", 10)
+    <Explanation of 'cart' in 'map', 1 edge: 0.00000001 s>
     """
 
     target: str
@@ -98,6 +113,13 @@ class Explanation(PlainData):
     def answerable(self) -> bool:
         """Whether a lookup had an answer."""
         return not self.errors
+
+    def __repr__(self) -> str:
+        answer = "no answer" if self.stamp is None else format_stamp(self.stamp)
+        return f"<Explanation of {self.source!r} in {self.target!r}, {counted(len(self.edges), 'edge')}: {answer}>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>"
 
     def __str__(self) -> str:
         when = ", latest" if isinstance(self.at, Latest) else f" at {format_stamp(self.at)}"

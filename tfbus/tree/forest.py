@@ -55,7 +55,7 @@ class KnownFrames:
         self._parents_of: dict[str, tuple[str, ...]] = {}
         self._mentions: dict[str, int] = {}
         self.frames: dict[str, None] = {}
-        self.changing = 0
+        self.changing: int = 0
         self._sorted: tuple[str, ...] | None = None
         self._some: tuple[str, ...] | None = None
 
@@ -169,11 +169,11 @@ class Path(Chain):
     def __init__(self, ups: list[FrameHistory], downs: list[FrameHistory], root: str) -> None:
         edges = ups + downs
         super().__init__(_fold(ups), _fold(downs), tuple(edge for edge in edges if edge.static))
-        self.root = root
-        self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
-        self.moving = tuple(edge for edge in edges if not edge.static)
+        self.root: str = root
+        self.frames: tuple[str, ...] = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
+        self.moving: tuple[FrameHistory, ...] = tuple(edge for edge in edges if not edge.static)
         self._changing = tuple(edge for edge in edges if edge.mixed)
-        self.permanent = not self._changing
+        self.permanent: bool = not self._changing
         self.rival: Path | None = None
 
     @property
@@ -455,7 +455,7 @@ class PathCache(Paths):
 
     def clear(self) -> None:
         """Forget all paths."""
-        self.recent = {}
+        self.recent: dict[str, dict[str, Chain]] = {}
         self._older = {}
         self._count = 0
 
@@ -486,7 +486,7 @@ class StaticFrames:
     def __init__(self) -> None:
         self.samples: dict[str, TransformStamped] = {}
         self.histories: dict[str, FrameHistory] = {}
-        self.names = KnownFrames()
+        self.names: KnownFrames = KnownFrames()
 
     def put(self, sample: TransformStamped) -> None:
         """Add a sample, or replace the one of its child."""
@@ -556,11 +556,11 @@ class Forest:
     """
 
     def __init__(self, window: int | None) -> None:
-        self.lock = threading.Lock()
+        self.lock: threading.Lock = threading.Lock()
         self.window = window
         self.frames: dict[str, FrameHistory] = {}
-        self.names = KnownFrames()
-        self.paths = PathCache(self.lock)
+        self.names: KnownFrames = KnownFrames()
+        self.paths: PathCache = PathCache(self.lock)
         self._local_paths: WeakSet[PathCache] = WeakSet()
         self.changing_paths: dict[tuple[str, str], Path] = {}
         self.changed: set[str] = set()
@@ -569,10 +569,10 @@ class Forest:
         self._suspects: list[TransformStamped] = []
         self.readers: dict[int, set[str]] = {}
         self.expired_samples: list[TransformStamped] = []
-        self.replaced = 0
-        self.expired = 0
-        self.looped = 0
-        self.structure = 0
+        self.replaced: int = 0
+        self.expired: int = 0
+        self.looped: int = 0
+        self.structure: int = 0
 
     @property
     def inserted(self) -> int:

@@ -109,7 +109,15 @@ _BLOCK = 64
 
 
 class Outcome(Enum):
-    """The effect of an insertion."""
+    """The effect of an insertion.
+
+    Examples
+    --------
+    >>> tree = TransformTree(keep=1.0)
+    >>> stamps = (from_seconds(5.0), from_seconds(5.0), 0)
+    >>> [tree.insert(TransformStamped("map", "cart", stamp, Transform())).name for stamp in stamps]
+    ['INSERTED', 'REPLACED', 'EXPIRED']
+    """
 
     INSERTED = "inserted"
     """A sample at a new stamp."""
@@ -121,7 +129,15 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """The newest edge of one frame; stamps in ns, None where there is no moving sample."""
+    """The newest edge of one frame; stamps in ns, None where there is no moving sample.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform()))
+    >>> tree.edges()[0].newest
+    10
+    """
 
     parent: str
     child: str
@@ -219,11 +235,11 @@ class FrameHistory(History):
 
     def __init__(self, child: str, parent: str, static: bool, keep: int | None) -> None:
         super().__init__(parent, keep)
-        self.child = child
-        self.static = static
+        self.child: str = child
+        self.static: bool = static
         self.static_row: Row = IDENTITY
-        self.changed = False
-        self.shared = False
+        self.changed: bool = False
+        self.shared: bool = False
         self._parents = NO_RUNS
         self._authorities = NO_RUNS
 
@@ -265,9 +281,9 @@ class FrameHistory(History):
             if self._parents or self._authorities:
                 self._forget_old_names()
         if parent != self.parent:
-            self.parent = parent
+            self.parent: str = parent
             self.changed = True
-        self.authority = authority
+        self.authority: str = authority
         return Outcome.INSERTED
 
     def insert_static(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
@@ -288,7 +304,7 @@ class FrameHistory(History):
         super().clear()
         self._parents = self._authorities = NO_RUNS
         if self.mixed:
-            self.mixed = False
+            self.mixed: bool = False
             self.changed = True
 
     def parent_at(self, stamp: int) -> str:

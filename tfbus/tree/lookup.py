@@ -49,6 +49,14 @@ class Hold:
     ----------
     max_age : float
         For how long, in s.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> _ = tree.insert(TransformStamped("map", "cart", 0, Transform()))
+    >>> answer = tree.lookup("map", "cart", from_seconds(0.1), extrapolate=Hold(0.5))
+    >>> answer.extrapolated_by
+    100000000
     """
 
     max_age: float
@@ -107,7 +115,14 @@ def _nanoseconds(seconds: float, name: str) -> int:
 
 
 class Question(NamedTuple):
-    """The arguments of a lookup: stamps in ns, `max_age` in s."""
+    """The arguments of a lookup: stamps in ns, `max_age` in s.
+
+    Examples
+    --------
+    >>> question = Question("map", "cart", LATEST)
+    >>> question.is_plain
+    True
+    """
 
     target: str
     source: str
@@ -256,9 +271,9 @@ class Extrapolation:
     __slots__ = ("extrapolated_by", "gap", "policy")
 
     def __init__(self, policy: Policy) -> None:
-        self.policy = policy
-        self.extrapolated_by = 0
-        self.gap = 0
+        self.policy: Policy = policy
+        self.extrapolated_by: int = 0
+        self.gap: int = 0
 
     def row(self, path: Path, at: int) -> Row:
         """Source in target along a path.

@@ -406,8 +406,10 @@ class Answers:
         self._count = len(stamps)
         self._parts: list[_Part] = []
         self.first_missing: int | None = None
-        self.connected = not len(stamps)
-        self.extrapolation = None if policy is None else np.zeros((2, len(stamps)), np.int64)
+        self.connected: bool = not len(stamps)
+        self.extrapolation: npt.NDArray[np.int64] | None = (
+            None if policy is None else np.zeros((2, len(stamps)), np.int64)
+        )
         for places, path in paths.split(stamps):
             here = stamps[places]
             if not len(here):

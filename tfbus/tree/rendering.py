@@ -245,6 +245,11 @@ def to_html(
     return f'<pre style="{_PRE}">{chr(10).join(lines)}</pre>'
 
 
+def cell(tree: str) -> str:
+    """The HTML of a tree as a notebook shows it: a large tree scrolls inside its cell, above the legend."""
+    return f'<div style="max-height: 36em; overflow-y: auto">{tree}</div>{legend()}'
+
+
 def legend() -> str:
     """The colours of the states, as one line of HTML."""
     names = (f'<span style="color: {state.value}">\u25cf {state.name.lower()}</span>' for state in EdgeState)

@@ -3,6 +3,8 @@
 `TransformTree` has no clock, no event loop and no input or output: it answers or it raises.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable
 from functools import partial
@@ -44,7 +46,7 @@ from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge, FrameHistory, Outcome, SavedFrame, samples_of, save_frame
 from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, Hold, answer, bounds_of, policy_of
 from tfbus.tree.lookup_many import OutOfRange, deskew, lookup_many
-from tfbus.tree.rendering import counted, describe, legend, to_dot, to_html, to_yaml
+from tfbus.tree.rendering import cell, counted, describe, to_dot, to_html, to_yaml
 from tfbus.tree.twist import twist, twist_many
 from tfbus.which_kernel import plain_first
 
@@ -92,7 +94,7 @@ class TransformTree:
 
     def __init__(self, keep: float | None = 10.0, *, max_translation: float = MAX_TRANSLATION) -> None:
         self.keep = keep
-        self.max_translation = as_max_translation(max_translation)
+        self.max_translation: float = as_max_translation(max_translation)
         self._stand_on(Forest(window_of(keep)))
         self._filled_by_bus = False
 
@@ -112,6 +114,14 @@ class TransformTree:
             Nothing is stored.
         TypeError
             If it is not a `TransformStamped`.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> tree.insert(TransformStamped("map", "cart", 0, Transform((1.0, 2.0, 0.0))))
+        <Outcome.INSERTED: 'inserted'>
+        >>> tree.insert(TransformStamped("map", "cart", 0, Transform((3.0, 4.0, 0.0))))
+        <Outcome.REPLACED: 'replaced'>
         """
         if not self._filled_by_bus and isinstance(sample, TransformStamped) and is_within(sample, self.max_translation):
             # The usual case, and much faster.
@@ -127,6 +137,12 @@ class TransformTree:
             If a sample would close a loop of parents, or a translation is not finite or longer than `max_translation`.
         TypeError
             If something in it is not a `TransformStamped`.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> tree.insert_many([TransformStamped("map", "cart", stamp, Transform()) for stamp in (0, 10)])
+        [<Outcome.INSERTED: 'inserted'>, <Outcome.INSERTED: 'inserted'>]
         """
         self._check_writable("use bus.publish, or a copy() of the tree")
         batch = as_batch(samples)
@@ -290,18 +306,63 @@ class TransformTree:
         otherwise the way that has samples does. If two other ways have samples, the frames count as not connected at
         that stamp. `looped` counts the samples that form such loops. The answer depends on the samples only, never on
         earlier questions.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "cart", 0, Transform()))
+        >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform((1.0, 0.0, 0.0))))
+        >>> tree.lookup("map", "cart", 5).transform.translation
+        (0.5, 0.0, 0.0)
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         bounds = bounds_of(not_before, not_after)
         return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
 
-    def can_transform(self, target: str, source: str, at: AtLike = LATEST, **question: Any) -> bool:
-        """Whether `lookup` with the same arguments has an answer now."""
-        known = None if question else self._paths.can_answer(target, source, at)
-        if known is not None:
-            return known
+    def can_transform(
+        self,
+        target: str,
+        source: str,
+        at: AtLike = LATEST,
+        *,
+        source_at: AtLike | None = None,
+        fixed: str | None = None,
+        not_before: StampLike | None = None,
+        not_after: StampLike | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> bool:
+        """Whether `lookup` with the same arguments has an answer now.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform()))
+        >>> tree.can_transform("map", "cart", 11)
+        False
+        >>> tree.can_transform("map", "cart", 11, tolerance=0.1)
+        True
+        """
+        travels = source_at is not None or fixed is not None
+        bounded = not_before is not None or not_after is not None
+        if not (travels or bounded or tolerance or max_gap is not None or extrapolate is not None):
+            known = self._paths.can_answer(target, source, at)
+            if known is not None:
+                return known
         try:
-            self.lookup(target, source, at, **question)
+            self.lookup(
+                target,
+                source,
+                at,
+                source_at=source_at,
+                fixed=fixed,
+                not_before=not_before,
+                not_after=not_after,
+                tolerance=tolerance,
+                max_gap=max_gap,
+                extrapolate=extrapolate,
+            )
         except TransformLookupError:
             return False
         return True
@@ -332,6 +393,15 @@ class TransformTree:
         ------
         TypeError
             As `lookup`. Here, a lookup without an answer is not an error.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform()))
+        >>> print(tree.explain("map", "cart", 11))
+        'cart' in 'map' at 0.000000011 s: no answer
+        ! map <- cart  one sample  age 0 ns  0.00000001 s ..
+        ! frame 'cart': asked for 0.000000011 s, newest sample is 0.00000001 s (1 ns short)
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         bounds = bounds_of(not_before, not_after)
@@ -450,6 +520,16 @@ class TransformTree:
             If the points have no stamps.
         TypeError
             If `cloud` is no `PointCloud`: ``to_points`` makes one of a `LaserScan`.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("odom", "laser", 0, Transform()))
+        >>> _ = tree.insert(TransformStamped("odom", "laser", 10, Transform((1.0, 0.0, 0.0))))
+        >>> cloud = PointCloud("laser", 10, np.zeros((2, 3)), np.array([0, 10]))
+        >>> tree.deskew(cloud, "laser", "odom").points
+        array([[-1.,  0.,  0.],
+               [ 0.,  0.,  0.]])
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         return deskew(self._forest, cloud, target, fixed, out_of_range, policy)
@@ -489,6 +569,14 @@ class TransformTree:
 
         tf2's `lookupVelocity` gives other numbers: its velocity is in the observer's axes already, and it rotates it
         once more, by the rotation of the body.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "cart", 0, Transform()))
+        >>> _ = tree.insert(TransformStamped("map", "cart", from_seconds(1.0), Transform((2.0, 0.0, 0.0))))
+        >>> tree.twist("cart", "map", from_seconds(0.5)).linear
+        (2.0, 0.0, 0.0)
         """
         axes = reference if expressed_in is None else expressed_in
         if at is not LATEST:
@@ -549,6 +637,14 @@ class TransformTree:
         ------
         UnknownFrameError, DisconnectedError, FutureExtrapolationError
             As `lookup`.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "odom", 10, Transform()))
+        >>> _ = tree.insert(TransformStamped("odom", "cart", 20, Transform()))
+        >>> tree.latest_common_stamp("map", "cart")
+        10
         """
         self._forest.search(target, source)
         with self._forest.lock:
@@ -561,6 +657,14 @@ class TransformTree:
         Raises
         ------
         UnknownFrameError, DisconnectedError
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "odom", 10, Transform()))
+        >>> _ = tree.insert(TransformStamped("odom", "cart", 10, Transform()))
+        >>> tree.chain("map", "cart")
+        ['map', 'odom', 'cart']
         """
         if at is not LATEST:
             at = as_stamp(at)
@@ -571,7 +675,15 @@ class TransformTree:
     # Questions about the tree itself
 
     def frames(self) -> list[str]:
-        """Every frame that a sample in the tree names, sorted."""
+        """Every frame that a sample in the tree names, sorted.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform()))
+        >>> tree.frames()
+        ['cart', 'map']
+        """
         return list(self._forest.known_frames())
 
     def parent(self, frame: str, at: AtLike = LATEST) -> str | None:
@@ -582,6 +694,13 @@ class TransformTree:
         UnknownFrameError
         ExtrapolationError
             If the stamp is outside the frame's window.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform()))
+        >>> tree.parent("cart")
+        'map'
         """
         if at is not LATEST:
             at = as_stamp(at)
@@ -615,6 +734,13 @@ class TransformTree:
         UnknownFrameError
         TypeError, ValueError
             If `at` is not a stamp.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert_many([TransformStamped("map", "cart", stamp, Transform()) for stamp in (0, 10)])
+        >>> [sample.stamp for sample in tree.samples_around("cart", 4)]
+        [0, 10]
         """
         stamp = as_stamp(at)
         with self._forest.lock:
@@ -721,7 +847,15 @@ class TransformTree:
         return stamps[(low <= stamps) & (stamps <= high)]
 
     def edges(self) -> list[Edge]:
-        """Every frame that has a parent, with its newest edge, sorted by name."""
+        """Every frame that has a parent, with its newest edge, sorted by name.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform(), "odometry"))
+        >>> [(edge.parent, edge.child, edge.samples, edge.authority) for edge in tree.edges()]
+        [('map', 'cart', 1, 'odometry')]
+        """
         edges = self._forest.read_all(FrameHistory.edge)
         return [edges[child] for child in sorted(edges)]
 
@@ -737,12 +871,29 @@ class TransformTree:
         Raises
         ------
         UnknownFrameError
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform()))
+        >>> tree.remove_frame("cart")
+        >>> tree.frames()
+        []
         """
         self._check_writable("use bus.remove_frame, or a copy() of the tree")
         self._forest.remove(frame)
 
     def clear(self) -> None:
-        """Drop all moving samples. Static ones and the frames' names stay."""
+        """Drop all moving samples. Static ones and the frames' names stay.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform()))
+        >>> tree.clear()
+        >>> tree
+        <TransformTree of 2 frames, 0 samples>
+        """
         self._check_writable("clear a copy() of it")
         self._forest.clear()
 
@@ -755,17 +906,34 @@ class TransformTree:
         ------
         TypeError, ValueError
             If `stamp` is not a stamp.
+
+        Examples
+        --------
+        >>> tree = TransformTree(keep=None)
+        >>> _ = tree.insert_many([TransformStamped("map", "cart", stamp, Transform()) for stamp in (0, 10, 20)])
+        >>> tree.forget_before(10)
+        >>> tree
+        <TransformTree of 2 frames, 2 samples, 0.00000001 s to 0.00000002 s>
         """
         self._check_writable("its samples leave it after `keep` seconds; or use a copy() of the tree")
         self._forest.rebuild(partial(save_frame, oldest=as_stamp(stamp)))
 
-    def copy(self) -> "TransformTree":
-        """An independent copy with the same samples, such as a snapshot to analyse elsewhere."""
+    def copy(self) -> TransformTree:
+        """An independent copy with the same samples, such as a snapshot to analyse elsewhere.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> copied = tree.copy()
+        >>> _ = tree.insert(TransformStamped("map", "cart", 10, Transform()))
+        >>> copied.frames()
+        []
+        """
         twin = TransformTree(self.keep, max_translation=self.max_translation)
         twin._stand_on(self._forest.copy())
         return twin
 
-    def __deepcopy__(self, memo: object) -> "TransformTree":
+    def __deepcopy__(self, memo: object) -> TransformTree:
         return self.copy()
 
     __copy__ = copy
@@ -789,6 +957,14 @@ class TransformTree:
         ----------
         now : int, optional
             The stamp that ages are counted from, in ns; by default the newest in the tree.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "dock", 0, Transform(), "survey", static=True))
+        >>> print(tree.describe())
+        map
+        └── dock  static  from 'survey'
         """
         return describe(self.edges(), now)
 
@@ -799,11 +975,26 @@ class TransformTree:
         ----------
         now : int, optional
             With it, each edge has the colour of its state at this stamp (ns), and its age and span in the label.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "dock", 0, Transform(), static=True))
+        >>> tree.to_dot().splitlines()[0]
+        'digraph tf {'
         """
         return to_dot(self.edges(), now)
 
     def to_yaml(self) -> str:
-        """The tree as YAML with tf2's keys; stamps in s."""
+        """The tree as YAML with tf2's keys; stamps in s.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(TransformStamped("map", "dock", 0, Transform(), static=True))
+        >>> tree.to_yaml().splitlines()[0]
+        '"dock":'
+        """
         return to_yaml(self.edges())
 
     def __repr__(self) -> str:
@@ -816,7 +1007,7 @@ class TransformTree:
     def _repr_html_(self) -> str:
         """The tree as notebooks show it, with ages counted from the newest stamp in it."""
         edges = self.edges()
-        return to_html(edges, max((edge.newest for edge in edges if edge.newest is not None), default=0)) + legend()
+        return cell(to_html(edges, max((edge.newest for edge in edges if edge.newest is not None), default=0)))
 
     def _check_writable(self, instead: str) -> None:
         if self._filled_by_bus:

@@ -43,10 +43,10 @@ class Timeline:
 
     def __init__(self) -> None:
         self.stamp: int | None = None
-        self.start = 0
-        self.end = 0
-        self.playing = False
-        self.speed = 1.0
+        self.start: int = 0
+        self.end: int = 0
+        self.playing: bool = False
+        self.speed: float = 1.0
 
     def choose(self, stamp: int, span: tuple[int, int]) -> None:
         """Stand still at a stamp of a span, both in ns."""
@@ -471,11 +471,11 @@ class Page:
         stale_after: float = STALE_AFTER,
     ) -> None:
         self.live = live
-        self.timeline = Timeline()
+        self.timeline: Timeline = Timeline()
         self.selected: str | None = None
         self.chosen_fixed = fixed
         self.labels: Labels = "selection"
-        self.trails = dict.fromkeys(trails)
+        self.trails: dict[str, str | None] = dict.fromkeys(trails)
         self.search = ""
         self.delays: Mapping[str, float] = {}
         self._events: tuple[Event, ...] = ()

@@ -43,7 +43,7 @@ class Solids:
         self._origins = np.array([solid.visual.origin._row for solid in self._solids]).reshape(-1, 7).T
         self._handles: list[viser.BatchedMeshHandle | None] = [None] * len(self._groups)
         self._drawn: tuple[bool, ...] = ()
-        self.opacity = 1.0
+        self.opacity: float = 1.0
         """The opacity of all shapes, from 0 to 1; 0 hides them."""
 
     def draw(self, scene: Scene) -> None:
@@ -294,8 +294,8 @@ class Panel:
             )
         with gui.add_folder("Show"):
             self._labels = gui.add_dropdown("Labels", ("selection", "all", "none"))
-            self.axes_length = gui.add_slider("Axes [m]", 0.01, 2.0, 0.01, 0.2)
-            self.robot = gui.add_slider(
+            self.axes_length: viser.GuiSliderHandle[float] = gui.add_slider("Axes [m]", 0.01, 2.0, 0.01, 0.2)
+            self.robot: viser.GuiSliderHandle[float] = gui.add_slider(
                 "Robot", 0.0, 1.0, 0.05, 0.5, visible=False, hint="Opacity of the robot: 0 hides it"
             )
         with gui.add_folder("Tree"):

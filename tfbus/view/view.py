@@ -132,7 +132,7 @@ class View(AsyncOnly):
         for frame in trails if fixed is None else (*trails, fixed):
             check_frame(frame)
         self.bus = bus
-        self.address = ""
+        self.address: str = ""
         self._buffer = buffer
         self._host, self._port = host, port
         self._door = WebDoor(host, origins)

@@ -144,7 +144,19 @@ _NEVER = 2**64
 
 @dataclass(frozen=True, slots=True)
 class PendingLookup:
-    """A waiting lookup: its question, when it began to wait (ns on the bus's clock), and the error that blocks it."""
+    """A waiting lookup: its question, when it began to wait (ns on the bus's clock), and the error that blocks it.
+
+    Examples
+    --------
+    >>> import anyio
+    >>> with Bus() as bus, Buffer(bus) as buffer:
+    ...     async with anyio.create_task_group() as tasks:
+    ...         _ = tasks.start_soon(buffer.lookup, "map", "cart")
+    ...         await anyio.wait_all_tasks_blocked()
+    ...         print(*buffer.pending())
+    ...         tasks.cancel_scope.cancel()
+    'cart' in 'map': frame 'map' is not known
+    """
 
     question: Question
     since: int
@@ -250,8 +262,8 @@ class WaitingIndex:
         # waiter that is in it.
         self._by_name: dict[str, dict[Waiter, None]] = {}
         self.limits: list[Place] = []
-        self.passed = STAMP_MIN
-        self.orders = count()
+        self.passed: int = STAMP_MIN
+        self.orders: count[int] = count()
 
     def __len__(self) -> int:
         return len(self.parked)
@@ -485,17 +497,17 @@ class LiveTree:
     def __init__(self, forest: Forest, on_loop: Callable[[LoopingSample], object] | None = None) -> None:
         self.forest = forest
         self._on_loop = on_loop
-        self.waiting = WaitingIndex()
-        self.watching = WatchIndex()
+        self.waiting: WaitingIndex = WaitingIndex()
+        self.watching: WatchIndex = WatchIndex()
         self.last_reset: ClockResetError | None = None
         self.tell_expired: Callable[[TransformStamped, int, str], bool] = lambda _sample, _newest, _authority: False
-        self.expired_ahead = 0
+        self.expired_ahead: int = 0
         self.superseded = 0
         self._waiters = self.waiting.by_frame
         self._watches = self.watching.by_frame
         # The readers of the forest for buffers that were closed since the last change.
         self._closed: list[ref[ReadsForest]] = []
-        self.feed = self.make_feed()
+        self.feed: Any = self.make_feed()
 
     def make_feed(self) -> Any:
         """A `Feed` of this tree; None without the compiled kernel."""
@@ -677,7 +689,7 @@ class Share:
     def __init__(self, live: LiveTree, before: BufferStatistics) -> None:
         self.live = live
         self.end_reason: str | None = None
-        self.feed = live.make_feed()
+        self.feed: Any = live.make_feed()
         if self.feed is not None:
             self.feed.share = self
         self._end_callbacks: dict[Registration, Callable[[], object]] = {}

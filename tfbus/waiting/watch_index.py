@@ -55,14 +55,14 @@ class WatchState:
     )
 
     def __init__(self, target: str, source: str, wake: Callable[[], object]) -> None:
-        self.target = target
-        self.source = source
-        self.wake = wake
-        self.outdated = True
-        self.updates = 0
+        self.target: str = target
+        self.source: str = source
+        self.wake: Callable[[], object] = wake
+        self.outdated: bool = True
+        self.updates: int = 0
         self.reset: ClockResetError | None = None
-        self.ended = False
-        self.waiting = False
+        self.ended: bool = False
+        self.waiting: bool = False
         self.frames: frozenset[str] = frozenset()
         self.path: Path | None = None
         self.share: object = None

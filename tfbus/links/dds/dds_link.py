@@ -503,6 +503,6 @@ class DdsLink(RosLink):
     ) -> None:
         if isinstance(peers, str):
             raise TypeError(f"peers must be several machines, not {peers!r}")
-        self.domain = as_domain(domain)
+        self.domain: int = as_domain(domain)
         carrier = DdsCarrier(self.domain, configuration(discovery, peers, config), settings_of(options))
         super().__init__(bus, carrier.id, carrier, **options)

@@ -145,13 +145,16 @@ class Connection:
         halves = key[: KEY // 2], key[KEY // 2 :]
         self._said, self._awaited = halves if dialled else halves[::-1]
         self.dialled = dialled
-        self.begun = self.grown = monotonic()
-        self.link = self.robot = ""
+        self.begun: float = monotonic()
+        self.grown: float = self.begun
+        self.link: str = ""
+        self.robot: str = ""
         self.heard: str | None = None
         self.hears: str | None = None
-        self.met = self.closed = False
-        self.tail = bytearray()
-        self.waits = waits
+        self.met: bool = False
+        self.closed: bool = False
+        self.tail: bytearray = bytearray()
+        self.waits: bool = waits
         self._reads = True
         # The rest of a frame whose writing has begun: nothing goes before it.
         self._rest: memoryview | None = None

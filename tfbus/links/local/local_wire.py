@@ -96,12 +96,12 @@ class LocalWire(Wire):
     """
 
     # A connection drops only the oldest waiting messages, so the last one before a silence arrives.
-    rest = 6.0
+    rest: float = 6.0
 
     def __init__(
         self, domain: str, robot: str = "", *, directory: str | None = None, loopback: bool | None = None
     ) -> None:
-        self.id = secrets.token_hex(16)
+        self.id: str = secrets.token_hex(16)
         self._robot = robot
         self._place = MeetingPlace(
             domain, self.id, directory, not hasattr(socket, "AF_UNIX") if loopback is None else loopback

@@ -101,8 +101,8 @@ class MeetingPlace:
         self._domain = blake2b(f"{kind} {domain}".encode(), digest_size=6).hexdigest()
         self._link = link
         self.loopback = loopback
-        self.name = ""
-        self.key = bytes(KEY)
+        self.name: str = ""
+        self.key: bytes = bytes(KEY)
 
     def open(self) -> socket.socket:
         """Listen, and show the link's name; also again, when the name has vanished.

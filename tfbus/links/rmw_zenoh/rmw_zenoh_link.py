@@ -331,7 +331,7 @@ class RmwZenohLink(RosLink):
             raise TypeError(f"a router must be a str, not {router!r}")
         if not isinstance(node, str) or not _NODE.fullmatch(node):
             raise ValueError(f"{node!r} cannot be the name of a node: letters, digits and _")
-        self.domain = as_domain(domain)
+        self.domain: int = as_domain(domain)
         carrier = RmwZenohCarrier(self.domain, node, configuration(router, config or {}), settings_of(options))
         super().__init__(bus, carrier.id, carrier, **options)
 

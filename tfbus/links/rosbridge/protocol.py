@@ -127,7 +127,7 @@ class LargeMessage:
 
     def __init__(self) -> None:
         self.parts: list[Decoded[ReceivedTransform]] = []
-        self.of_ros2 = False
+        self.of_ros2: bool = False
 
 
 async def read_large(message: str | bytes, give_way: GiveWay) -> Incoming:

@@ -83,7 +83,7 @@ class Confirmation:
         self._missing: dict[str, TransformStamped] = {}
         self._sent = anyio.Event()
         self._complete = anyio.Event()
-        self.doubted = False
+        self.doubted: bool = False
 
     def expect(self, samples: Sequence[TransformStamped]) -> None:
         """All static frames, which are published now, have to come back."""

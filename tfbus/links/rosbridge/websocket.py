@@ -73,7 +73,7 @@ class WebSocket:
         self._received: Iterator[Event] = iter(())
         self._budget = TurnBudget()
         self._sending = anyio.Lock()
-        self.heard = anyio.current_time()
+        self.heard: float = anyio.current_time()
 
     @classmethod
     async def connect(cls, url: str, max_size: int, timeout: float) -> Self:

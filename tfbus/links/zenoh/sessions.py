@@ -264,8 +264,8 @@ class Keeper:
     """
 
     def __init__(self, keep: Callable[[], object]) -> None:
-        self.changed = threading.Event()
-        self.stopped = False
+        self.changed: threading.Event = threading.Event()
+        self.stopped: bool = False
         self._thread = threading.Thread(target=keep, name=_NAME, daemon=True)
 
     def start(self) -> None:

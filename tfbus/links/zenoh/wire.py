@@ -121,7 +121,7 @@ class ZenohWire(Wire):
         config: Settings | None = None,
         lease: float | None = None,
     ) -> None:
-        self.id = os.urandom(16).hex()
+        self.id: str = os.urandom(16).hex()
         self._domain = f"tfbus/{domain}"
         self._own = f"{self._domain}/{robot or NO_ROBOT}"
         self._addresses = deque(endpoints(connect or ()))

@@ -79,7 +79,7 @@ class SqliteStorage:
         self._path = path
         self._steps = 0
         journals = [each for each in (_beside(path, "-journal"), _beside(path, "-wal")) if _is_used(each)]
-        self.finished = not journals
+        self.finished: bool = not journals
         try:
             if not journals:
                 # Without "immutable", SQLite would create an empty log beside the recording.
@@ -299,7 +299,7 @@ class FolderStorage:
             self.close()
             raise
         self._refused = list(map(str, refused))
-        self.finished = not refused and all(file.finished for file in self._files)
+        self.finished: bool = not refused and all(file.finished for file in self._files)
 
     def _choose(self, path: Path) -> list[Path]:
         """The files of the recording; a remark is noted for each ignored file."""

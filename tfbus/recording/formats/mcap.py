@@ -187,9 +187,9 @@ class McapReading:
         self.wants = wants
         self.counts: Counter[int] = Counter()
         self._budget = UnfoldBudget.of_file(storage.size)
-        self.unknown = 0
+        self.unknown: int = 0
         self.contradictions: set[int] = set()
-        self.finished_once = False
+        self.finished_once: bool = False
 
     def by_index(self, low: int, high: int) -> Iterator[list[StoredMessage]]:
         """The messages of all chunks that overlap the range, in the order of their log times."""
@@ -351,14 +351,14 @@ class McapStorage:
         self._path = path
         self._file = path.open("rb") if file is None else file
         try:
-            self.size = self._file.seek(0, 2)
+            self.size: int = self._file.seek(0, 2)
             self._schemas: dict[int, records.Schema] = {}
             self._numbered: dict[int, Channel] = {}
             self._budget = DescriptionBudget()
             self._chunks: list[IndexedChunk] = []
             self._statistics: records.Statistics | None = None
             self._counted: Counter[int] | None = None
-            self.finished = self._read_index()
+            self.finished: bool = self._read_index()
             if not self.finished and next(self._log_times(), None) is None:
                 raise RecordingError("the file ends before its first message", path=str(path), reason="truncated")
         except BaseException:

@@ -147,10 +147,10 @@ class McapOutput:
             from mcap.writer import Writer
         except ImportError:
             raise ImportError(f"recording needs one more package: {pip_install('bag')}") from None
-        self.samples = 0
-        self.messages = 0
-        self.buffered = 0
-        self.unattributed = 0
+        self.samples: int = 0
+        self.messages: int = 0
+        self.buffered: int = 0
+        self.unattributed: int = 0
         self.refused: Counter[str] = Counter()
         self._buffered_messages = 0
         self._file = _UnbufferedFile(path, overwrite)

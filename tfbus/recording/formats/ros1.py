@@ -333,7 +333,7 @@ class Ros1Storage:
             self._contradictions: set[int] = set()
             self._finished_once = False
             self._counted: Counter[int] | None = None
-            self.finished = self._read_index()
+            self.finished: bool = self._read_index()
             if not self.finished:
                 self._find_chunks()
         except BaseException:

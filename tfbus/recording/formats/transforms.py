@@ -301,14 +301,14 @@ class ChannelDecoder:
         self.channel = channel
         self.static = static
         self.prefix = prefix
-        self.authorities = _authorities(channel)
+        self.authorities: tuple[Run, ...] = _authorities(channel)
         self._count = sum(count for _, count in self.authorities)
         self._is_cdr = channel.encoding == "cdr" and not channel.type.endswith("FrameTransform")
         # The usual case, and several times as fast.
         self.decode_plain: Callable[[bytes], tuple[TransformStamped, ...] | None] | None = None
         if self._is_cdr and not prefix and len(self.authorities) == 1:
             self.decode_plain = plain_decoder((self.authorities[0][0], static), MAX_MESSAGE)
-        self.parse = parser_of(channel)
+        self.parse: Callable[[bytes], list[RawTransform]] = parser_of(channel)
         self._single: set[bytes] = set()
         self._names: dict[tuple[str, str], tuple[str, str]] = {}
 
