@@ -30,7 +30,8 @@ WITH_EXTRAS = {
 }
 """Modules whose examples need an extra, and a package of it."""
 
-DOORS = ["tfbus", "tfbus.analysis", "tfbus.links", "tfbus.recording", "tfbus.robot", "tfbus.testing"]
+DOORS = [f"tfbus.{room}" for room in ("analysis", "axes", "camera", "earth", "links", "recording", "robot", "testing")]
+DOORS += ["tfbus", "tfbus.web"]
 
 WITHOUT_EXAMPLE = """
     Arrival AuthorityConflict BufferServer.cancel BufferServer.lose BufferServer.statistics BufferServer.take
@@ -40,7 +41,7 @@ WITHOUT_EXAMPLE = """
     Link.send_soon Link.stir LinkStatistics MessageFilter.set_target PastLoop PeerJoined PeerLost PeerRejected
     Player.resume Player.step RecorderStatistics RecordingDropped RecordingFailed Reparented
     RobotStatePublisher.publish_state RobotStatistics SampleRejected Spread StampAhead StampBehind
-    StaticTransform Statistics Stream.put SubscriberFailed ThreadPublisher.discard ThreadPublisher.end
+    StaticTransform Statistics SubscriberFailed ThreadPublisher.discard ThreadPublisher.end
     ThreadPublisher.forget Transform.as_scipy Transform.from_scipy TransformArray.as_scipy
     TransformArray.from_scipy TransformArray.to_dataframe load_joint_states
 """

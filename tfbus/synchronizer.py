@@ -50,6 +50,11 @@ class SynchronizedSet(NamedTuple):
         One of each stream, in the order of the streams.
     transforms : tuple of TransformStamped
         From the frame of each message into the target.
+
+    Examples
+    --------
+    >>> SynchronizedSet(("an image", "a scan"), ()).messages[1]
+    'a scan'
     """
 
     messages: tuple[Any, ...]
@@ -207,6 +212,15 @@ class Synchronizer(AsyncOnly):
 
     The iteration ends when a stream has ended and no further set is possible. An error of a stream is raised unchanged
     by the iteration, after the sets that are ready.
+
+    Examples
+    --------
+    >>> async def points(frame: str, *stamps: int):
+    ...     for stamp in stamps:
+    ...         yield PointStamped(frame, stamp, (1.0, 0.0, 0.0))
+    >>> async with Synchronizer(points("camera", 100, 200), points("laser", 103, 199), within=1e-8) as sets:
+    ...     print([(image.stamp, scan.stamp) async for image, scan in sets])
+    [(100, 103), (200, 199)]
     """
 
     def __init__(

@@ -104,6 +104,12 @@ class Odometry(CopiedByFields, PlainData):
         ------
         TypeError
             If the stamp is `LATEST`.
+
+        Examples
+        --------
+        >>> odometry = Odometry("odom", 0, "base_link", Transform((2.0, 0.0, 0.0)), (0.5, 0.0, 0.0), (0.0, 0.0, 0.1))
+        >>> odometry.as_transform(invert=True).child
+        'odom'
         """
         return pose_as_transform(self, self.child, invert=invert)
 
@@ -134,6 +140,13 @@ class TwistWithCovarianceStamped(CopiedByFields, PlainData):
     A transform moves the velocity as that of a `TwistStamped`, and the covariance S to A S A^T with its adjoint map A:
     with a lever arm, an uncertain rotation makes the linear part uncertain. If a variance is negative, the covariance
     is unknown and stays as it is.
+
+    Examples
+    --------
+    >>> wheel = TwistWithCovarianceStamped("wheel", 0, (1.0, 0.0, 0.0), (0.0, 0.0, 0.5), np.diag([0.0] * 5 + [0.01]))
+    >>> moved = do_transform(wheel, TransformStamped("base", "wheel", 0, Transform((0.0, 2.0, 0.0))))
+    >>> moved.linear, float(moved.covariance[0, 0])
+    ((2.0, 0.0, 0.0), 0.04)
     """
 
     frame: str
@@ -171,6 +184,14 @@ class VelocityStamped(PlainData):
     -----
     A transform turns both parts to the axes of another frame; there is no lever arm, because the velocity stays that of
     the origin of `body`.
+
+    Examples
+    --------
+    >>> velocity = VelocityStamped("odom", 0, "base_link", "odom", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    >>> quarter = Transform.from_axis_angle((0.0, 0.0, 1.0), np.pi / 2)
+    >>> moved = do_transform(velocity, TransformStamped("map", "odom", 0, quarter))
+    >>> moved.body, round(moved.linear[1], 6)
+    ('base_link', 1.0)
     """
 
     frame: str
@@ -205,6 +226,14 @@ class AccelStamped(PlainData):
     -----
     A transform turns both parts. They stay the acceleration of the same point of the body: that of another point
     depends on the angular velocity, which the message does not have.
+
+    Examples
+    --------
+    >>> quarter = Transform.from_axis_angle((0.0, 0.0, 1.0), np.pi / 2)
+    >>> seen = AccelStamped("imu", 0, (1.0, 0.0, 9.5), (0.0, 0.0, 0.0))
+    >>> moved = do_transform(seen, TransformStamped("base", "imu", 0, quarter))
+    >>> [round(number, 6) for number in moved.linear]
+    [0.0, 1.0, 9.5]
     """
 
     frame: str
@@ -244,6 +273,14 @@ class Imu(CopiedByFields, PlainData):
     A transform turns rates, accelerations and their covariances. The orientation becomes that of the target frame,
     against the same world, so its covariance stays: the same as tf2_sensor_msgs does. The lever arm between two places
     on a body is left out, because it depends on the angular acceleration.
+
+    Examples
+    --------
+    >>> half = Transform.from_axis_angle((1.0, 0.0, 0.0), np.pi)
+    >>> imu = Imu("imu", 0, None, (0.0, 0.0, 0.5), (0.0, 0.0, -9.5))
+    >>> moved = do_transform(imu, TransformStamped("base", "imu", 0, half))
+    >>> round(moved.angular_velocity[2], 6), round(moved.linear_acceleration[2], 6)
+    (-0.5, 9.5)
     """
 
     frame: str
@@ -285,6 +322,13 @@ class InertiaStamped(CopiedByFields, PlainData):
     Notes
     -----
     A transform moves the centre, and turns the moments, I -> R I R^T.
+
+    Examples
+    --------
+    >>> load = InertiaStamped("tool", 0, 2.0, (0.0, 0.0, 0.1), np.eye(3))
+    >>> moved = do_transform(load, TransformStamped("flange", "tool", 0, Transform((0.0, 0.0, 0.2))))
+    >>> moved.mass, round(moved.center[2], 6)
+    (2.0, 0.3)
     """
 
     frame: str

@@ -81,6 +81,12 @@ class Path(CopiedByFields, PlainData):
         If a shape is wrong, or a row is not finite, or too far from a unit quaternion.
     ValueError
         If there is not one stamp for each pose.
+
+    Examples
+    --------
+    >>> path = Path("map", 0, [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]] * 2, [10, 20])
+    >>> path.poses.stamps
+    array([10, 20])
     """
 
     frame: str

@@ -205,6 +205,12 @@ class NavSatFix(CopiedByFields, PlainData):
         -1 without a fix, 0 with one, 1 with augmentation by satellites, 2 by stations on the ground.
     service : int
         The systems that the receiver uses, a sum of 1 (GPS), 2 (GLONASS), 4 (BeiDou) and 8 (Galileo).
+
+    Examples
+    --------
+    >>> fix = NavSatFix("gps", 0, 48.0, 11.0, 500.0)
+    >>> fix.latitude, fix.covariance
+    (48.0, None)
     """
 
     frame: str

@@ -125,6 +125,14 @@ class TwistArray:
         Velocity in m/s. NaN where there is no answer.
     angular : array of shape (n, 3)
         Angular velocity in rad/s; NaN as `linear`.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> outcomes = tree.insert_columns("map", "base_link", [0, SECOND], [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]],
+    ...                                [[0.0, 0.0, 0.0, 1.0]] * 2)
+    >>> tree.twist_many("base_link", "map", [0, SECOND // 2])
+    <TwistArray of 2 along the axes of 'map'>
     """
 
     frame: str

@@ -215,7 +215,13 @@ class TransformStamped(Sample):
         return qualified_answer(target, source, stamp, row, static, *policy_use)
 
     def inverse(self) -> TransformStamped:
-        """The transform in the other direction, with the names of the two frames exchanged; also as ``~t``."""
+        """The transform in the other direction, with the names of the two frames exchanged; also as ``~t``.
+
+        Examples
+        --------
+        >>> (~TransformStamped("map", "base", 0, Transform((2.0, 0.0, 0.0)))).parent
+        'base'
+        """
         parent, child, stamp, row, _, static = self._fields
         return answer_of(child, parent, stamp, invert_row(row), static)
 

@@ -291,6 +291,17 @@ def save_trajectory(path: str | os.PathLike[str], transforms: TransformArray, *,
         If the file exists already.
     OSError
         If it cannot be written.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> steps = TransformArray([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]] * 2, [0, 1_000_000_000])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder) / "steps.tum"
+    ...     save_trajectory(file, steps)
+    ...     print(file.read_text(), end="")
+    0.000000000 0.0 0.0 0.0 0.0 0.0 0.0 1.0
+    1.000000000 1.0 0.0 0.0 0.0 0.0 0.0 1.0
     """
     target = Path(path)
     kind = FORMATS.get(target.suffix)
