@@ -18,7 +18,7 @@ from support.samples import moving, static
 from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, TransformStamped
 from tfbus.links import BufferServer, DomainLink
 from tfbus.links.message import MAX_SAMPLES, Kind, Outgoing, kind_of, write_message
-from tfbus.links.relay import OutgoingBatch
+from tfbus.links.replica import OutgoingBatch
 from tfbus.links.seams import Hearing, Receive
 
 pytestmark = pytest.mark.anyio

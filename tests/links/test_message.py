@@ -36,8 +36,7 @@ from tfbus.links.message import (
     write_message,
     write_text,
 )
-from tfbus.links.relay import Entry, OutgoingBatch, ReceivedBatch, RemovedFrame
-from tfbus.links.replica import Claim
+from tfbus.links.replica import Claim, Entry, OutgoingBatch, ReceivedBatch, RemovedFrame
 from tfbus.tf_message import MalformedMessageError, encode
 
 ONE, OTHER, BUS = b"0123456789abcdef", b"fedcba9876543210", b"a bus of a robot"

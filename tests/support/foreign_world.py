@@ -4,8 +4,9 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from tfbus import InvalidTransformError, Transform, TransformStamped
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch, ReceivedTransform, Turn
-from tfbus.links.seams import Carrier, Received, ReceivedMessage, SendReport
+from tfbus.links.replica import OutgoingBatch, ReceivedBatch, ReceivedTransform
+from tfbus.links.ros.foreign_end import Carrier, ReceivedMessage, Turn
+from tfbus.links.seams import Received, SendReport
 from tfbus.tf_message import MalformedMessageError
 
 

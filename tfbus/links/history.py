@@ -5,7 +5,6 @@ meanwhile, so that the samples of each frame come in order. The answers have the
 frame, so a sample that comes both live and in an answer is published once.
 """
 
-from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from math import inf
@@ -13,8 +12,7 @@ from math import inf
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.message import Heard, Kind, write_text
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch
-from tfbus.links.replica import Replica
+from tfbus.links.replica import Known, OutgoingBatch, ReceivedBatch
 from tfbus.stamps import from_seconds
 from tfbus.tree.history import FrameHistory
 
@@ -34,29 +32,29 @@ MOST_REMEMBERED = 10_000
 """The most peers that are remembered as asked."""
 
 
-def chunk_of_past(bus: Bus, replica: Replica, seconds: float, after: str) -> tuple[list[OutgoingBatch], bool]:
+def chunk_of_past(bus: Bus, brought: Iterable[Known], seconds: float, after: str) -> tuple[list[OutgoingBatch], bool]:
     """The moving samples of the last seconds that a link tells to a peer, and whether these are all.
 
     Parameters
     ----------
     bus : Bus
         Its buffers hold the samples.
-    replica : Replica
-        The copy of the frames that the link brings.
+    brought : iterable of Known
+        The frames that the link brings.
     seconds : float
     after : str
         The chunk begins with the first frame whose name comes after this one.
     """
-    frames = replica.moving()
+    moving = [known for known in brought if known.frame > after and known.sample and not known.sample.static]
     told: list[OutgoingBatch] = []
     count = 0
-    for place in range(bisect_right(frames, after), len(frames)):
-        newest, samples = replica.entries[frames[place]], _recent(bus, frames[place], seconds)
+    for known in sorted(moving, key=lambda known: known.frame):
+        samples = _recent(bus, known.frame, seconds)
         if not samples:
             continue
         if told and count + len(samples) > CHUNK:
             return told, False
-        told.append(OutgoingBatch(newest.origin, newest.number, samples))
+        told.append(OutgoingBatch(known.source.origin, known.source.sequence, samples))
         count += len(samples)
     return told, True
 

@@ -43,8 +43,7 @@ from tfbus.errors import (
     TransformLookupError,
 )
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import Entry, OutgoingBatch, ReceivedBatch, ReceivedTransform, RemovedFrame
-from tfbus.links.replica import Claim
+from tfbus.links.replica import Claim, Entry, OutgoingBatch, ReceivedBatch, ReceivedTransform, RemovedFrame
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
 from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode, decode_in_parts, encode, refusal

@@ -15,12 +15,12 @@ from typing import Any, Unpack
 from tfbus.bus.bus import Bus
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.endpoint import ForeignEnd
 from tfbus.links.link import Link
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch, ReceivedTransform, Turn
+from tfbus.links.replica import OutgoingBatch, ReceivedBatch, ReceivedTransform
+from tfbus.links.ros.foreign_end import Carrier, ForeignEnd, ReceivedMessage, Turn
 from tfbus.links.ros.messages import decode_clock, decode_text
 from tfbus.links.ros.settings import RosOptions, RosSettings
-from tfbus.links.seams import Carrier, Received, ReceivedMessage, SendReport
+from tfbus.links.seams import Received, SendReport
 from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, MalformedMessageError, decode, decode_in_parts, refusal
 
