@@ -40,7 +40,7 @@ BOUNDS = [
         ("links.zenoh.wire", "MAX_LINKS MAX_CHANNELS"),
         ("links.zenoh.sessions", "OPENING_TIME"),
         ("links.domain", "_LONGEST_NAME"),
-        ("links.message", "MAX_LOOKUP MAX_DEPTH"),
+        ("links.message", "MAX_DEPTH"),
         ("links.lookups", "LONGEST_WAIT PATIENCE"),
         ("links.ros.ros_link", "MAX_SIZE MAX_OTHER_SIZE AT_ONCE PART MOST_TRANSFORMS"),
         ("links.rosbridge.rosbridge_link", "MOST_QUEUED SILENCE MOST_SAID"),

@@ -403,7 +403,7 @@ def test_messages_of_large_batches_do_not_wait_for_the_past_beyond_a_bound() -> 
     asker.joined("one")
     asker.joined("other")
     samples = [moving("map", "arm", stamp) for stamp in range(1_000)]
-    heard = Heard(Kind.LIVE, BUS, 1, entries=[ReceivedBatch(samples, (), BUS, 1)])  # type: ignore[arg-type]
+    heard = Heard(Kind.LIVE, BUS, 1, entries=[ReceivedBatch(BUS, 1, samples)])
     held = sum(asker.holds("one", heard) + asker.holds("other", heard) for _ in range(500))
     assert held == MOST_HELD_SAMPLES // 1_001
     asker.end("one")

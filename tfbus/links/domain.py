@@ -161,9 +161,7 @@ class DomainEnd(Endpoint):
 
     def detach(self) -> None:
         self.lookups.close()
-        peers = list(self.peers.values())
-        self.peers.clear()
-        for peer in peers:
+        for peer in list(self.peers.values()):
             self._forget(peer)
         self.relay.detach(self)
 
@@ -212,9 +210,10 @@ class DomainEnd(Endpoint):
 
     # For its parts
 
-    def sign_soon(self) -> None:
-        """Sign in the next turn of the event loop, or `SOONEST_SIGN` after the last sign."""
-        self._sign_within(SOONEST_SIGN)
+    def sign_soon(self, seconds: float = SOONEST_SIGN) -> None:
+        """Sign so many seconds after the last sign, or in the next turn of the event loop, if no sign is due before."""
+        self._sign_due = min(self._sign_due, self._signed_at + seconds)
+        self.host.stir()
 
     def serve(self, server: BufferServer | None) -> None:
         """Serve a buffer, or none any more."""
@@ -245,11 +244,7 @@ class DomainEnd(Endpoint):
         period = max(SIGN_PERIOD, SIGN_PERIOD_EACH * len(self.peers))
         if period < self._sign_period:
             self._sign_period = period
-            self._sign_within(period)
-
-    def _sign_within(self, seconds: float) -> None:
-        self._sign_due = min(self._sign_due, self._signed_at + seconds)
-        self.host.stir()
+            self.sign_soon(period)
 
     def _sign(self, now: float) -> None:
         self._signed_at, self._sign_due = now, now + self._sign_period
@@ -381,19 +376,16 @@ class DomainEnd(Endpoint):
         view, news = self._view_of(peer.robot), False
         together: list[ReceivedTransform] = []
         for entry in heard.entries:
-            assert entry.origin is not None
-            size = len(entry.samples) if isinstance(entry, ReceivedBatch) else 1
             if not self.relay.is_plausible(entry.sequence):
                 # It would make all later numbers of its origin old.
                 why = f"a batch with the number {entry.sequence}, which is too far ahead of all others"
-                self.reject(peer.id, "number", ValueError(why), size)
+                self.reject(peer.id, "number", ValueError(why), entry.size)
                 continue
             self.relay.heard(entry.sequence)
             source = Provenance(entry.origin, entry.sequence, self, peer)
             if isinstance(entry, ReceivedBatch):
                 # The authorities of a bus beyond the peer do not count as the peer's.
-                others = entry.origin not in peer.paths
-                if not others and not self._admit_authorities(peer, entry.authorities, size):
+                if entry.origin in peer.paths and not self._admit_authorities(peer, entry.samples):
                     continue
                 is_new, admitted = self._judge(peer, view, source, entry.samples, heard.kind)
                 news = news or is_new
@@ -520,9 +512,7 @@ class DomainEnd(Endpoint):
         self.lookups.left(peer.id)
         self._resting.pop(peer.id, None)
         self._forget_robots(peer.robot)
-        lost = {bus for bus in peer.paths if self.relay.way_closed(bus)}
-        if peer.paths:
-            self.relay.reach_changed(self)
+        _, lost = self.relay.reach_changed(self) if peer.paths else ((), set[bytes]())
         return lost
 
     def _update_ways(self, peer: Peer, heard: Heard) -> None:
@@ -538,12 +528,8 @@ class DomainEnd(Endpoint):
         paths.pop(own, None)
         if paths == peer.paths:
             return
-        before, peer.paths = peer.paths, paths
-        opened = [bus for bus in paths if bus not in before and not self.relay.reaches(bus)]
-        for bus in paths.keys() - before.keys():
-            self.relay.way_opened(bus)
-        lost = {bus for bus in before.keys() - paths.keys() if self.relay.way_closed(bus)}
-        self.relay.reach_changed(self)
+        peer.paths = paths
+        opened, lost = self.relay.reach_changed(self)
         self._withdraw(lost)
         if self.drop_lost and opened:
             self._show()
@@ -563,13 +549,12 @@ class DomainEnd(Endpoint):
 
     def _answer(self, sender: str, fields: dict[str, Any]) -> None:
         since, names = fields.get("since"), fields.get("frames")
-        frames = None
         if type(since) is not int or not 0 <= since < 2**64:
             raise MalformedMessageError("text", f"a question since {since!r}"[:100])
-        if names is not None:
-            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-                raise MalformedMessageError("text", "a filter without names")
-            frames = frozenset(names)
+        if not isinstance(names, list | None) or not all(isinstance(name, str) for name in names or ()):
+            raise MalformedMessageError("text", "a filter without names")
+        frames = None if names is None else frozenset(names)
+        if frames is not None:
             if self.frames is None or frames <= self.frames:
                 self._agreement.filters(sender, frames)
             self._channels.serve(frames, self._now())

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import OnceLogger, SeenKeys
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
+from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.relay import REMEMBERED_REASONS, Outbox, Peer, relay_of
 from tfbus.links.replica import Entry
 from tfbus.links.seams import Joined, Left, Received, SendReport
@@ -298,19 +299,16 @@ class Endpoint(Outbox):
     def _warn_not_sent(self, error: Exception) -> None:
         self._log.warning(str(error), "not sent over the link %s: %s", self.name, error)
 
-    def _admit_authorities(self, peer: Peer, authorities: Collection[str], samples: int) -> bool:
-        """Note the authorities that a batch names; returns False, and refuses the batch, if they are too many."""
-        for authority in authorities:
-            if authority not in peer.authorities:
-                text = peer.authority_text + len(authority)
-                if len(peer.authorities) >= MAX_AUTHORITIES or text > MOST_AUTHORITY_TEXT:
-                    error = ValueError(
-                        f"the peer has spoken for more than {MAX_AUTHORITIES} authorities, or for very long ones"
-                    )
-                    self.reject(peer.id, "too many authorities", error, samples)
-                    return False
-                peer.authorities.add(authority)
-                peer.authority_text = text
+    def _admit_authorities(self, peer: Peer, samples: Collection[TransformStamped]) -> bool:
+        """Note the authorities of a batch; returns False, and refuses the batch, if they are too many."""
+        for authority in {sample._fields[4] for sample in samples} - peer.authorities:
+            text = peer.authority_text + len(authority)
+            if len(peer.authorities) >= MAX_AUTHORITIES or text > MOST_AUTHORITY_TEXT:
+                why = f"the peer has spoken for more than {MAX_AUTHORITIES} authorities, or for very long ones"
+                self.reject(peer.id, "too many authorities", ValueError(why), len(samples))
+                return False
+            peer.authorities.add(authority)
+            peer.authority_text = text
         return True
 
     def _notify(self) -> None:

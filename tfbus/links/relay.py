@@ -24,7 +24,6 @@ The relay also counts the ways to each bus, its *reach*: a link with `drop_lost`
 not reached any more. They are not removed: see `tfbus.links.replica`.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -171,7 +170,7 @@ class Relay:
         # The views to which all that this bus says itself is added.
         self._route: tuple[View, ...] = ()
         self._removing: tuple[str, Provenance | None] | None = None
-        self._ways: Counter[bytes] = Counter()
+        self._reached: set[bytes] = set()
         self._remembers = False
 
     def attach(self, outbox: Outbox, foreign: bool = False) -> None:
@@ -286,35 +285,22 @@ class Relay:
 
     def reaches(self, origin: bytes) -> bool:
         """Whether a bus is reached on any way; this one always is."""
-        return origin == self.replica.origin or self._ways[origin] > 0
+        return origin == self.replica.origin or origin in self._reached
 
-    def way_opened(self, origin: bytes) -> None:
-        """Count one more way to a bus."""
-        self._ways[origin] += 1
-
-    def way_closed(self, origin: bytes) -> bool:
-        """Count one way less to a bus; returns whether that was the last one."""
-        self._ways[origin] -= 1
-        if self._ways[origin] > 0:
-            return False
-        del self._ways[origin]
-        return True
+    def reach_changed(self, outbox: Outbox) -> tuple[set[bytes], set[bytes]]:
+        """The buses that are reached only since the ways of a link have changed, and those that no longer are."""
+        before = self._reached
+        self._reached = {origin for one in self._outboxes for origin, _ in one.ways()}
+        for other in self._outboxes:
+            if other is not outbox:
+                # It tells them to its peers.
+                other.reach_changed()
+        return self._reached - before, before - self._reached
 
     def reach_besides(self, outbox: Outbox) -> dict[bytes, tuple[bytes, ...]]:
         """The buses that other links than this one lead to, each with the buses on the shortest way there."""
-        found: dict[bytes, tuple[bytes, ...]] = {}
-        for other in self._outboxes:
-            if other is not outbox:
-                for origin, path in other.ways():
-                    if origin not in found or len(path) < len(found[origin]):
-                        found[origin] = path
-        return found
-
-    def reach_changed(self, outbox: Outbox) -> None:
-        """Let the other links than this one know that they have to tell a new reach."""
-        for other in self._outboxes:
-            if other is not outbox:
-                other.reach_changed()
+        ways = (way for other in self._outboxes if other is not outbox for way in other.ways())
+        return dict(sorted(ways, key=lambda way: len(way[1]), reverse=True))
 
     def frames_of(self, owns: Callable[[Provenance], bool]) -> list[str]:
         """The frames on the bus whose newest sample has such a source, sorted."""

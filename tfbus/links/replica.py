@@ -196,26 +196,11 @@ class ReceivedTransform(TransformStamped):
         return TransformStamped, (self.parent, self.child, self.stamp, self.transform, self.authority, self.static)
 
 
-@dataclass(eq=False, slots=True)
-class ReceivedBatch:
-    """Samples of one batch, as they came in.
+class ReceivedBatch(OutgoingBatch):
+    """A batch as it came in; the provenance of its samples is not set yet."""
 
-    Attributes
-    ----------
-    samples : list of ReceivedTransform
-        Their provenance is not set yet.
-    authorities : collection of str
-        The authorities that the batch names; a peer may name only so many.
-    origin : bytes or None
-        The bus on which the batch was published first, 16 bytes; None if the sender knows no buses, as ROS.
-    sequence : int
-        The batch's number on that bus; without an origin it is not used.
-    """
-
+    __slots__ = ()
     samples: list[ReceivedTransform]
-    authorities: Collection[str]
-    origin: bytes | None = None
-    sequence: int = 0
 
 
 # The map

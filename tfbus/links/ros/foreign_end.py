@@ -9,7 +9,7 @@ from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.endpoint import Endpoint
 from tfbus.links.relay import Peer
-from tfbus.links.replica import MANY_ORIGINS, Entry, Provenance, ReceivedBatch, ReceivedTransform, RemovedFrame
+from tfbus.links.replica import MANY_ORIGINS, Entry, Provenance, ReceivedTransform, RemovedFrame
 from tfbus.links.seams import Received, SendReport
 
 
@@ -39,17 +39,17 @@ class ReceivedMessage:
 
     Attributes
     ----------
-    batches : list of ReceivedBatch
-        In the order in which they were published; they have no origin.
+    samples : list of ReceivedTransform
+        They are published as one batch.
     errors : list of InvalidTransformError
-        One for each sample that was refused; `batches` have the others.
+        One for each sample that was refused; `samples` has the others.
     time : int or None
         The time of the sender's clock, in ns, if it tells that.
     continues : bool
         Whether it is a later part of a message that was counted.
     """
 
-    batches: list[ReceivedBatch]
+    samples: list[ReceivedTransform]
     errors: list[InvalidTransformError] = field(default_factory=list)
     time: int | None = None
     continues: bool = False
@@ -114,7 +114,7 @@ class Carrier(Protocol):
     def read(self, content: Any) -> ReceivedMessage:
         """Decode a message: the content of an item that the carrier has passed to `receive`.
 
-        Its batches become this bus's own, and go out by the other links of the bus and never by this one. Samples that
+        Its samples become this bus's own, and go out by the other links of the bus and never by this one. Samples that
         cannot be decoded are in the message's errors.
 
         Raises
@@ -224,10 +224,8 @@ class ForeignEnd(Endpoint):
             self.messages += 1
         for error in message.errors:
             self.reject(sender, error.reason, error)
-        for batch in message.batches:
-            if self.bus.closed or not self._admit_authorities(peer, batch.authorities, len(batch.samples)):
-                continue
-            self._publish(peer, [one for one in batch.samples if self.frames is None or one.child in self.frames])
+        if self._admit_authorities(peer, message.samples):
+            self._publish(peer, [one for one in message.samples if self.frames is None or one.child in self.frames])
 
     def _publish(self, peer: Peer, samples: Sequence[ReceivedTransform]) -> None:
         """Publish those samples that did not go over this bus before, within the bounds on frames."""

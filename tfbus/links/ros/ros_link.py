@@ -16,7 +16,7 @@ from tfbus.bus.bus import Bus
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.link import Link
-from tfbus.links.replica import OutgoingBatch, ReceivedBatch, ReceivedTransform
+from tfbus.links.replica import OutgoingBatch, ReceivedTransform
 from tfbus.links.ros.foreign_end import Carrier, ForeignEnd, ReceivedMessage, Turn
 from tfbus.links.ros.messages import decode_clock, decode_text
 from tfbus.links.ros.settings import RosOptions, RosSettings
@@ -159,8 +159,7 @@ class RosCarrier(Carrier):
                 errors.append(error.with_traceback(None))
             else:
                 samples.append(sample)
-        batches = [ReceivedBatch(samples, {authority})] if samples else []
-        return ReceivedMessage(batches, errors=errors, continues=content.continues)
+        return ReceivedMessage(samples, errors=errors, continues=content.continues)
 
     async def run(self) -> None:
         """Do nothing that takes time."""
