@@ -206,7 +206,7 @@ class Relay:
         self._remembers = self._remembers and bool(self._outboxes)
         for known in self.replica.entries.values():
             if not self._remembers:
-                known.passed.clear()
+                known.passed = None
             for source in (known.source, known.shown):
                 if source is not None and source.outbox is outbox:
                     # Otherwise the frame would keep the link in memory.
@@ -224,7 +224,7 @@ class Relay:
     def clock_jumped_back(self) -> None:
         """Take samples with the stamps of earlier ones for news."""
         for known in self.replica.entries.values():
-            known.passed = {key: None for key in known.passed if key[2] is not None}
+            known.passed = {key: None for key in known.passed or () if key[2] is not None} or None
 
     def is_plausible(self, number: int) -> bool:
         """Whether a number may be one that a bus has given by now.
@@ -268,7 +268,7 @@ class Relay:
     def has_passed(self, sample: TransformStamped) -> bool:
         """Whether a sample of a world without origins went over this bus before."""
         known = self.replica.entries.get(sample.child)
-        return known is not None and _key(sample) in known.passed
+        return known is not None and known.passed is not None and _key(sample) in known.passed
 
     def remove(self, frame: str, source: Provenance | None) -> None:
         """Remove a frame from the bus for a peer, or with None withdraw it: other buses are not told of that."""
@@ -371,7 +371,7 @@ class Relay:
         if source is None:
             if known is not None and shown is not None:
                 # A withdrawn sample may come again unchanged.
-                known.passed.clear()
+                known.passed = None
                 for outbox in self._outboxes:
                     # The other ends of a link of tfbus see for themselves that the owner was lost.
                     if outbox.own is None:
@@ -380,7 +380,7 @@ class Relay:
         removal = RemovedFrame(source.origin, source.sequence, frame)
         if known is None or known.source is not source:
             self.replica.note(frame, source, None, self._route if sendable(removal, _ignore) else ())
-        if known is not None:
+        if known is not None and known.passed:
             # Copies of the last samples may come late.
             known.passed = dict.fromkeys(list(known.passed)[-_PASSED_OF_GONE:])
         for outbox in self._outboxes:
@@ -411,7 +411,8 @@ def _key(sample: TransformStamped) -> tuple[str, int, Row | None]:
 def _remember(known: Known, sample: TransformStamped) -> None:
     """Remember that a sample has passed; one that passes again is as new as any."""
     key = _key(sample)
-    known.passed.pop(key, None)
-    known.passed[key] = None
-    if len(known.passed) > MOST_PASSED:
-        del known.passed[next(iter(known.passed))]
+    passed = known.passed = known.passed or {}
+    passed.pop(key, None)
+    passed[key] = None
+    if len(passed) > MOST_PASSED:
+        del passed[next(iter(passed))]

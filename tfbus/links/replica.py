@@ -228,7 +228,7 @@ class Known:
     numbers : dict of bytes to int
         The newest number that each origin has given a sample which was published here, and under b"" the highest of the
         forgotten origins.
-    passed : dict
+    passed : dict or None
         The newest samples that went over the bus, beside a world without origins.
     sequence : int
         The number of the change; 0 while it has none.
@@ -244,7 +244,7 @@ class Known:
     shown: Provenance | None = None
     floor: Rank = LOWEST
     numbers: dict[bytes, int] = field(default_factory=dict)
-    passed: dict[tuple[str, int, Row | None], None] = field(default_factory=dict)
+    passed: dict[tuple[str, int, Row | None], None] | None = None
     sequence: int = 0
     digest: int = 0
 

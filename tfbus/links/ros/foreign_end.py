@@ -206,7 +206,7 @@ class ForeignEnd(Endpoint):
             if not self.bus.closed and known is not None and known.shown is not None and known.shown.peer is peer:
                 self.relay.remove(frame, self._source(peer))
                 # The next peer may bring the frame unchanged.
-                known.passed.clear()
+                known.passed = None
         return tuple(frames)
 
     def _source(self, peer: Peer) -> Provenance:
