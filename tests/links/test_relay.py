@@ -158,6 +158,30 @@ def test_a_link_that_begins_later_brings_what_its_bus_has_and_one_that_has_ended
     assert (set(one.frames), set(other.frames)) == ({"before", "after"}, {"before"})
 
 
+def test_what_no_message_can_hold_keeps_nothing_else_from_late_joiners() -> None:
+    world, (one, _) = domains(GRAPHS["pair"])
+    too_long = "x" * 100_000
+    one.say(static("map", too_long))
+    for names in ("a", "ab"):
+        one.say(static("map", names[-1]))
+        late = world.process(one.wire.network)
+        world.run(5.0)
+        assert set(late.frames) == set(names)
+        one.remove(too_long)
+
+
+def test_a_moving_sample_from_before_a_static_one_or_a_removal_is_no_news_when_it_is_late() -> None:
+    world = World()
+    network = Network(world)
+    listener = world.process(network)
+    one, other = Stranger(network), Stranger(network)
+    one.say(one.batch(static("map", "a"), number=10), one.removal("b", number=10))
+    one.say(one.batch(moving("map", "a", 12), moving("map", "b", 12), number=12))
+    other.say(other.batch(moving("map", "a", 9), moving("map", "b", 9), number=9))
+    other.say(other.batch(moving("map", "a", 11), moving("map", "b", 11), number=11))
+    assert [sample.stamp for sample in listener.seen if not sample.static] == [12, 12, 11, 11]
+
+
 # Lost peers
 
 

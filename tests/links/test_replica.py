@@ -125,7 +125,10 @@ def test_views_of_one_copy_agree_with_copies_of_their_own_frames_and_a_frame_tha
     both, left, right = Replica(), filled(["l", "x"]), filled(["r", "x"])
     views = View(both), View(both)
     for view, frame in zip((*views, *views), ("l", "r", "x", "x"), strict=True):
+        before = both.sequence
         both.note(frame, Provenance(OTHER, 1), static("map", frame), view.route)
+        # Also a frame that the other view has is told since then.
+        assert len(view.changes(before, 0.0)[0]) == 1
     assert [view.claim(0.0).digest for view in views] == [copy.claim(0.0).digest for copy in (left, right)]
     both.note("x", Provenance(OTHER, 2), static("map", "x"), views[0].route)
     for copy in (left, right):
