@@ -167,7 +167,12 @@ def test_what_no_message_can_hold_keeps_nothing_else_from_late_joiners() -> None
         late = world.process(one.wire.network)
         world.run(5.0)
         assert set(late.frames) == set(names)
+        assert not late.end.rejected
         one.remove(too_long)
+        world.run(100.0)
+        one.wire.network.sent()
+        world.run(100.0)
+        assert one.wire.network.sent(Kind.QUESTION) == 0
 
 
 def test_a_moving_sample_from_before_a_static_one_or_a_removal_is_no_news_when_it_is_late() -> None:
