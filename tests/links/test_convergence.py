@@ -34,7 +34,7 @@ PLACES = {
 ALL_TROUBLES = (25, 15, 12, 6, 6, 6, 6, 8, 6, 8, 6, 3, 4, 4)
 OF_PLACES = (25, 15, 12, 0, 0, 6, 6, 8, 6, 12, 6, 3, 4, 4)
 WITHOUT_DEATHS = (25, 15, 12, 0, 0, 6, 6, 8, 6, 0, 6, 3, 4, 4)
-"""What a robot has said that is dead, only other links of that robot tell to late joiners."""
+"""Only other links of a dead robot tell its frames to late joiners."""
 
 
 def trouble(

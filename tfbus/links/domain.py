@@ -93,7 +93,7 @@ class DomainEnd(Endpoint):
     Attributes
     ----------
     own : View
-        What the links of this robot bring.
+        The frames that the links of this robot bring.
     lookups : RemoteLookups
     """
 

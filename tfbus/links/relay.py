@@ -63,9 +63,9 @@ class Outbox:
     pending : int
         How many samples and removals wait to go out.
     views : dict of str to View
-        What the links of each robot bring by this link.
+        The frames that the links of each robot bring by this link.
     own : View or None
-        That of them which this link tells; None if it tells no entries.
+        The view of them that this link tells; None if it tells no entries.
     """
 
     own: View | None = None

@@ -108,7 +108,7 @@ Rank = tuple[int, bytes]
 LOWEST: Rank = (-1, b"")
 
 
-# What is said
+# Statements
 
 
 @dataclass(eq=False, slots=True)
@@ -224,7 +224,7 @@ class Known:
     shown : Provenance or None
         The source of the newest sample on the bus; None while the bus does not show the frame.
     floor : Rank
-        That of the newest static sample or removal: no sample before it is news.
+        The rank of the newest static sample or removal: no sample before it is news.
     numbers : dict of bytes to int
         The newest number that each origin has given a sample which was published here, and under b"" the highest of the
         forgotten origins.
@@ -494,7 +494,7 @@ class View:
     Attributes
     ----------
     digest : int
-        That of its settled entries.
+        The digest of its settled entries.
     route : tuple of View
         The views to which all that comes by this one is added: this one, and those that the other links tell.
     """

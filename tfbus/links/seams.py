@@ -136,7 +136,7 @@ class Wire(Protocol):
         """
 
 
-# What both kinds of links have
+# Both kinds of links
 
 
 @dataclass(frozen=True, slots=True)

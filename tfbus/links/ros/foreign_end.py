@@ -210,7 +210,7 @@ class ForeignEnd(Endpoint):
         return tuple(frames)
 
     def _source(self, peer: Peer) -> Provenance:
-        """What this world says gets the name and the next number of this bus."""
+        """The source of the next batch of this world: it has the name and the next number of this bus."""
         return Provenance(self.relay.replica.origin, self.relay.next_number(), self, peer)
 
     def _take(self, sender: str, content: Any) -> None:
