@@ -22,10 +22,10 @@ links.history.MOST_HELD links.history.MOST_HELD_SAMPLES links.history.PATIENCE l
 links.local.local_wire.MOST_STRANGERS links.local.local_wire.PATIENCE links.local.connection.LONGEST_HELLO
 links.local.connection.MOST_PUBLISHED links.local.connection.MOST_SENT links.local.local_wire.MOST_UNFINISHED
 links.local.meeting_place.LONGEST_PATH links.zenoh.sessions.UNSENT links.zenoh.wire.MAX_LINKS
-links.zenoh.wire.MAX_CHANNELS links.zenoh.sessions.OPENING_TIME links.domain._LONGEST_NAME links.message.MAX_LOOKUP
-links.message.MAX_DEPTH links.lookups.LONGEST_WAIT links.lookups.PATIENCE links.ros.ros_link.MAX_SIZE
-links.ros.ros_link.MAX_OTHER_SIZE links.ros.ros_link.AT_ONCE links.ros.ros_link.PART
-links.ros.ros_link.MOST_TRANSFORMS links.rosbridge.rosbridge_link.MOST_QUEUED links.rosbridge.rosbridge_link.SILENCE
+links.zenoh.wire.MAX_CHANNELS links.zenoh.sessions.OPENING_TIME links.domain._LONGEST_NAME links.message.MAX_DEPTH
+links.lookups.LONGEST_WAIT links.lookups.PATIENCE links.ros.ros_link.MAX_SIZE links.ros.ros_link.MAX_OTHER_SIZE
+links.ros.ros_link.AT_ONCE links.ros.ros_link.PART links.ros.ros_link.MOST_TRANSFORMS
+links.rosbridge.rosbridge_link.MOST_QUEUED links.rosbridge.rosbridge_link.SILENCE
 links.rosbridge.rosbridge_link.MOST_SAID links.rosbridge.protocol.MAX_VALUE links.rosbridge.protocol.MAX_TEXT
 links.rosbridge.protocol.MOST_TRANSFORMS links.rosbridge.protocol.QUEUE links.dds.dds_link._DEPTH
 links.dds.dds_link._KEPT links.dds.readers.MOST_WAITING links.dds.readers.MOST_BYTES links.ros.settings._LAST_DOMAIN

@@ -5,6 +5,7 @@
 
 import os
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 from support.domains import Network, Process, Stranger, World, agree, shown
@@ -32,6 +33,8 @@ PLACES = {
 """The networks on which processes are that are started again when they die."""
 ALL_TROUBLES = (25, 15, 12, 6, 6, 6, 6, 8, 6, 8, 6, 3, 4, 4)
 OF_PLACES = (25, 15, 12, 0, 0, 6, 6, 8, 6, 12, 6, 3, 4, 4)
+WITHOUT_DEATHS = (25, 15, 12, 0, 0, 6, 6, 8, 6, 0, 6, 3, 4, 4)
+"""Only other links of a dead robot tell its frames to late joiners."""
 
 
 def trouble(
@@ -196,6 +199,25 @@ def test_programs_that_are_started_again_agree_after_each_of_several_troubles(
             world.process(*(networks[number] for number in place), drop_lost=drop_lost)
         for _ in range(5):
             trouble(world, networks, world.random.randint(1, 15), [drop_lost], OF_PLACES)
+            end_of_trouble(world, networks)
+            until_they_agree(world, [world.processes])
+            check_truth(world)
+
+
+@pytest.mark.parametrize("drop_lost", [False, True])
+@pytest.mark.parametrize("places", PLACES.values(), ids=PLACES)
+@few_or_many(1, SEEDS // 10)
+def test_links_of_several_robots_agree_after_each_of_several_troubles(
+    seeds: range, places: list[list[int]], drop_lost: bool
+) -> None:
+    for seed in seeds:
+        world = World(seed)
+        networks = [Network(world) for _ in range(3)]
+        for place in places:
+            robot: dict[str, Any] = world.random.choice([{}, {"robot": "r1"}, {"robot": "r2"}])
+            world.process(*(networks[number] for number in place), drop_lost=drop_lost, **robot)
+        for _ in range(3):
+            trouble(world, networks, world.random.randint(1, 15), [drop_lost], WITHOUT_DEATHS)
             end_of_trouble(world, networks)
             until_they_agree(world, [world.processes])
             check_truth(world)

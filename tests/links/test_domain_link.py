@@ -1,7 +1,9 @@
 """`DomainLink` on an event loop, over a network in memory."""
 
 import asyncio
+import gc
 import os
+import weakref
 from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Any
@@ -18,7 +20,7 @@ from support.samples import moving, static
 from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, TransformStamped
 from tfbus.links import BufferServer, DomainLink
 from tfbus.links.message import MAX_SAMPLES, Kind, Outgoing, kind_of, write_message
-from tfbus.links.relay import OutgoingBatch
+from tfbus.links.replica import OutgoingBatch
 from tfbus.links.seams import Hearing, Receive
 
 pytestmark = pytest.mark.anyio
@@ -204,6 +206,23 @@ async def test_a_bus_that_closes_while_the_wire_opens_is_not_linked_and_one_that
             await until(lambda: bool(link.peers))
             await settle()
             assert link.statistics().rejected == {}
+
+
+async def test_a_later_link_brings_the_newest_moving_samples_of_others_and_no_frame_keeps_an_ended_one() -> None:
+    near, far = MemoryNetwork(), MemoryNetwork()
+    with Bus() as one, Bus() as bridge, Bus() as other:
+        links = [DomainLink(bridge, "tf", near.wire())]
+        async with DomainLink(one, "tf", near.wire()), links[0]:
+            await until(lambda: len(links[0].peers) == 1)
+            one.publish(moving("map", "goal", 1))
+            await until(lambda: bridge.statistics().frames == 1)
+            async with DomainLink(bridge, "tf", far.wire()), DomainLink(other, "tf", far.wire()):
+                await until(lambda: other.statistics().frames == 1)
+        ended = weakref.ref(links[0])
+        near = far = MemoryNetwork()
+        links.clear()
+        gc.collect()
+        assert ended() is None
 
 
 async def test_a_bus_that_links_again_hears_and_says_nothing_twice() -> None:

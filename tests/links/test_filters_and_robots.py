@@ -12,7 +12,8 @@ from tfbus.links import DomainLink
 from tfbus.links.channels import LONGEST_FILTER, MOST_FILTERS, filter_name
 from tfbus.links.domain import MOST_ROBOTS
 from tfbus.links.message import Heard, Kind, read_message, write_text
-from tfbus.links.relay import ReceivedBatch
+from tfbus.links.relay import relay_of
+from tfbus.links.replica import ReceivedBatch
 
 
 @pytest.fixture
@@ -174,19 +175,21 @@ def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer(world: World, netwo
     assert not quiet.end.rejected
 
 
-def test_of_robots_that_have_gone_so_many_copies_are_kept_and_the_oldest_make_room(
-    world: World, network: Network
+@pytest.mark.parametrize("drop_lost", [False, True])
+def test_of_robots_that_have_gone_so_many_are_remembered_and_the_oldest_make_room(
+    world: World, network: Network, drop_lost: bool
 ) -> None:
-    stays = world.process(network)
+    stays = world.process(network, drop_lost=drop_lost)
     for number in range(MOST_ROBOTS + 5):
         robot = world.process(network, robot=f"r{number}")
         robot.say(static("map", f"{number}"))
         world.run(0.5)
         world.end(robot)
         world.run(0.1)
-    assert len(stays.frames) == MOST_ROBOTS + 5
-    kept = {sample.child for entry in stays.end.kept() for sample in getattr(entry, "samples", ())}
-    assert kept == {f"{number}" for number in range(5, MOST_ROBOTS + 5)}
+    assert len(stays.frames) == (0 if drop_lost else MOST_ROBOTS + 5)
+    assert set(stays.end.views) == {"", *(f"r{number}" for number in range(5, MOST_ROBOTS + 5))}
+    oldest = 5 if drop_lost else 0
+    assert set(relay_of(stays.bus).replica.entries) == {f"{number}" for number in range(oldest, MOST_ROBOTS + 5)}
 
 
 def test_what_a_link_publishes_goes_to_each_hearer_in_its_own_way(world: World, network: Network) -> None:

@@ -14,9 +14,8 @@ from support.samples import moving, static
 from tfbus import Bus, PeerJoined, PeerLost, PeerRejected, SimulatedClock
 from tfbus._aio.turn_budget import TurnBudget
 from tfbus.links import Link
-from tfbus.links.endpoint import ForeignEnd
-from tfbus.links.relay import Turn
-from tfbus.links.seams import Joined, Left, Received, ReceivedMessage, SendReport
+from tfbus.links.ros.foreign_end import ForeignEnd, ReceivedMessage, Turn
+from tfbus.links.seams import Joined, Left, Received, SendReport
 from tfbus.tf_message import MalformedMessageError
 
 pytestmark = pytest.mark.anyio

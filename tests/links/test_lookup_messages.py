@@ -16,7 +16,7 @@ from tfbus import (
     TransformStamped,
 )
 from tfbus.links.message import (
-    MAX_LOOKUP,
+    MAX_TEXT,
     RemoteQuestion,
     read_answer,
     read_question,
@@ -39,9 +39,9 @@ def test_a_question_is_read_as_it_was_written(message: RemoteQuestion) -> None:
 
 
 def test_so_large_a_message_is_read_and_no_larger_one() -> None:
-    largest = write_question(QUESTION).ljust(MAX_LOOKUP)
+    largest = write_question(QUESTION).ljust(MAX_TEXT)
     assert read_question(largest) == QUESTION
-    with pytest.raises(ValueError, match=f"{MAX_LOOKUP + 1} bytes, more than {MAX_LOOKUP}"):
+    with pytest.raises(ValueError, match=f"{MAX_TEXT + 1} bytes, more than {MAX_TEXT}"):
         read_question(largest + b" ")
 
 
@@ -58,7 +58,7 @@ def test_so_large_a_message_is_read_and_no_larger_one() -> None:
         b'{"type": %b, "message": "m", "cause": null}' % (b"[" * 300 + b"]" * 300),
         b'{"type": "ValueError", "message": ["m"]}',
         b'{"type": {}, "message": "m"}',
-        write_question(RemoteQuestion("m" * MAX_LOOKUP, "base", 1)),
+        write_question(RemoteQuestion("m" * MAX_TEXT, "base", 1)),
     ],
 )
 def test_other_bytes_are_no_question_and_no_answer(data: bytes) -> None:

@@ -4,18 +4,21 @@ import copy
 import pickle
 import struct
 from collections.abc import Callable, Sequence
+from itertools import count
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import strategies as some
 from support.domains import Network, Process, Stranger, World, agree
+from support.foreign_world import ForeignTransform, ForeignWorld
 from support.processes import peak_of
 from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, PeerLost, SimulatedClock, TransformStamped
 from tfbus.links.message import Kind
-from tfbus.links.relay import PassedSamples, ReceivedTransform
+from tfbus.links.relay import MOST_PASSED
+from tfbus.links.replica import ReceivedTransform
 from tfbus.tf_message import decode, encode
 
 Graph = Sequence[Sequence[int]]
@@ -153,6 +156,35 @@ def test_a_link_that_begins_later_brings_what_its_bus_has_and_one_that_has_ended
     bridge.bus.publish(static("map", "alone"))
     world.run(3.0)
     assert (set(one.frames), set(other.frames)) == ({"before", "after"}, {"before"})
+
+
+def test_what_no_message_can_hold_keeps_nothing_else_from_late_joiners() -> None:
+    world, (one, _) = domains(GRAPHS["pair"])
+    too_long = "x" * 100_000
+    one.say(static("map", too_long))
+    for names in ("a", "ab"):
+        one.say(static("map", names[-1]))
+        late = world.process(one.wire.network)
+        world.run(5.0)
+        assert set(late.frames) == set(names)
+        assert not late.end.rejected
+        one.remove(too_long)
+        world.run(100.0)
+        one.wire.network.sent()
+        world.run(100.0)
+        assert one.wire.network.sent(Kind.QUESTION) == 0
+
+
+def test_a_moving_sample_from_before_a_static_one_or_a_removal_is_no_news_when_it_is_late() -> None:
+    world = World()
+    network = Network(world)
+    listener = world.process(network)
+    one, other = Stranger(network), Stranger(network)
+    one.say(one.batch(static("map", "a"), number=10), one.removal("b", number=10))
+    one.say(one.batch(moving("map", "a", 12), moving("map", "b", 12), number=12))
+    other.say(other.batch(moving("map", "a", 9), moving("map", "b", 9), number=9))
+    other.say(other.batch(moving("map", "a", 11), moving("map", "b", 11), number=11))
+    assert [sample.stamp for sample in listener.seen if not sample.static] == [12, 12, 11, 11]
 
 
 # Lost peers
@@ -334,11 +366,21 @@ def test_a_quaternion_that_is_a_little_off_is_normalised_once_and_then_copied_as
 # Samples that passed over a bus beside worlds without origins
 
 
-def passed(*samples: TransformStamped, per_child: int = 3, gone_children: int = 2) -> PassedSamples:
-    memory = PassedSamples(per_child, gone_children)
-    for sample in samples:
-        memory.add(sample)
-    return memory
+class Beside:
+    """A bus of a foreign world and of a network on which a stranger says things again, as another bus's."""
+
+    def __init__(self) -> None:
+        self.world, self.place = World(), ForeignWorld()
+        network = Network(self.world)
+        self.process = self.world.process(network, worlds=[self.place])
+        self.stranger = Stranger(network)
+        self.numbers = count(2**51)
+        self.stranger.say()
+
+    def is_news(self, sample: TransformStamped) -> bool:
+        before = len(self.process.seen)
+        self.stranger.say(self.stranger.batch(sample, number=next(self.numbers)))
+        return len(self.process.seen) > before
 
 
 @pytest.mark.parametrize(
@@ -351,29 +393,36 @@ def passed(*samples: TransformStamped, per_child: int = 3, gone_children: int = 
         (moving("map", "a", 5), moving("map", "b", 5), False),
         (moving("map", "a", 5), static("map", "a", stamp=5), False),
         (static("map", "a", stamp=5), moving("map", "a", 5), False),
-        (static("map", "a", 1.0, authority="x"), static("map", "a", 1.0, authority="y"), True),
-        (static("map", "a", 1.0), static("map", "a", 2.0), False),
-        (static("map", "a", 1.0), static("map", "a", 1.0, stamp=1), False),
+        # Static ones are ranked instead.
+        (static("map", "a", 1.0, authority="x"), static("map", "a", 1.0, authority="y"), False),
     ],
 )
-def test_a_sample_is_known_by_child_parent_stamp_and_kind_and_a_static_one_by_its_value(
+def test_beside_another_world_a_moving_sample_is_known_by_child_parent_stamp_and_kind(
     first: TransformStamped, second: TransformStamped, same: bool
 ) -> None:
-    assert (second in passed(first)) is same
+    beside = Beside()
+    beside.process.say(first)
+    assert beside.is_news(second) is not same
 
 
-def test_so_many_samples_of_each_child_are_remembered_and_what_passes_again_is_new() -> None:
-    samples = [moving("map", "a", stamp) for stamp in range(5)]
-    memory = passed(moving("map", "b", 0), *samples[:3], samples[0], samples[3])
-    assert [sample in memory for sample in samples] == [True, False, True, True, False]
-    assert moving("map", "b", 0) in memory
+def test_what_comes_back_from_another_world_is_no_news_and_a_static_frame_is_known_by_its_value_too() -> None:
+    place, twin = ForeignWorld(), ForeignTransform("map", "a", 0, 1.0)
+    process = World().process(worlds=[place])
+    process.say(static("map", "a", 1.0), moving("map", "b", 5, 1.0))
+    place.say(twin, static=True)
+    place.say(ForeignTransform("map", "b", 5, 2.0))
+    assert len(process.seen) == 2
+    place.say(twin._replace(x=2.0), static=True)
+    place.say(twin._replace(stamp=1, x=2.0), static=True)
+    place.say(ForeignTransform("map", "b", 6, 2.0))
+    assert len(process.seen) == 5
 
 
-def test_children_that_left_are_remembered_up_to_a_bound_and_one_that_came_back_as_before() -> None:
-    memory = passed(*(moving("map", name, 1) for name in ("back", "stays", *"abc")))
-    memory.retire("back")
-    memory.add(moving("map", "back", 2))
-    for name in ("never there", *"abac"):
-        memory.retire(name)
-    known = {name: moving("map", name, 1) in memory for name in ("back", "stays", *"abc")}
-    assert known == {"back": True, "stays": True, "a": True, "b": False, "c": True}
+def test_so_many_samples_of_each_frame_are_remembered_and_some_of_a_frame_that_was_removed() -> None:
+    beside = Beside()
+    beside.process.say(*(moving("map", "a", stamp) for stamp in range(MOST_PASSED + 2)), moving("map", "b", 0))
+    assert [beside.is_news(moving("map", "a", stamp)) for stamp in (2, MOST_PASSED, 1)] == [False, False, True]
+    assert not beside.is_news(moving("map", "b", 0))
+    beside.process.remove("a")
+    assert not beside.is_news(moving("map", "a", MOST_PASSED + 1))
+    assert beside.is_news(moving("map", "a", 3))

@@ -2,11 +2,12 @@
 
 import random
 from collections.abc import Iterable
+from contextlib import suppress
 
 import pytest
 from support.samples import moving, static
 
-from tfbus.links.relay import OutgoingBatch, RemovedFrame
+from tfbus import TransformStamped
 from tfbus.links.replica import (
     CHUNK,
     MANY_ORIGINS,
@@ -16,74 +17,101 @@ from tfbus.links.replica import (
     SETTLING,
     Agreement,
     Claim,
+    OutgoingBatch,
+    Provenance,
     Question,
+    RemovedFrame,
     Replica,
     TooManyEntriesError,
+    View,
 )
 
-OWN, OTHER = b"the own bus.....", b"another bus....."
+OTHER = b"another bus....."
 Model = dict[str, tuple[int, bytes]]
 
 
-def ranks_in(replica: Replica) -> Model:
-    return {frame: (entry.number, entry.origin) for frame, entry in replica.entries.items()}
+class Copy(View):
+    """A copy of the map with one view."""
+
+    def __init__(self, max_frames: int = 100) -> None:
+        self.replica = Replica()
+        self._max_frames = max_frames
+        super().__init__(self.replica)
+
+    @property
+    def ranks(self) -> Model:
+        return {frame: known.source.rank for frame, known in self.replica.entries.items()}
+
+    def note(
+        self, frame: str, rank: tuple[int, bytes], sample: TransformStamped | None, *, settles: bool = False
+    ) -> bool:
+        number, origin = rank
+        most = self._max_frames
+        return self.replica.note(
+            frame, Provenance(origin, number), sample, self.route, max_frames=most, settles=settles
+        )
 
 
-def filled(frames: Iterable[str], number: int = 1, origin: bytes = OTHER, max_frames: int = 100) -> Replica:
-    replica = Replica(max_frames, OWN)
+def filled(frames: Iterable[str], number: int = 1) -> Copy:
+    copy = Copy()
     for frame in frames:
-        replica.note(frame, (number, origin), static("map", frame))
-    return replica
+        copy.note(frame, (number, OTHER), static("map", frame))
+    return copy
 
 
 def test_a_frame_that_moves_all_the_time_is_not_in_the_digest_until_it_rests() -> None:
-    replica, still = filled("a"), filled("a")
+    copy, still = filled("a"), filled("a")
     for step in range(100):
-        replica.note("m", (2 + step, OTHER), moving("map", "m", step), settles=True)
-        assert replica.claim(step * 0.1).digest == still.claim(0.0).digest
+        copy.note("m", (2 + step, OTHER), moving("map", "m", step), settles=True)
+        assert copy.claim(step * 0.1).digest == still.claim(0.0).digest
     # It is told to who asks, settled or not.
-    assert len(replica.changes(0, 10.0)[0]) == 2
-    rested = replica.claim(9.9 + SETTLING)
+    assert len(copy.changes(0, 10.0)[0]) == 2
+    rested = copy.claim(9.9 + SETTLING)
     still.note("m", (101, OTHER), moving("map", "m", 99))
     assert rested.digest == still.claim(20.0).digest
 
 
 def test_of_two_samples_of_one_batch_the_newer_is_held() -> None:
-    replica = Replica(10, OWN)
-    assert replica.note("a", (1, OTHER), moving("map", "a", 5))
-    assert not replica.note("a", (1, OTHER), moving("map", "a", 4))
-    assert replica.note("a", (1, OTHER), moving("map", "a", 6))
-    assert not replica.note("a", (1, OTHER), None)
+    copy = Copy()
+    assert copy.note("a", (1, OTHER), moving("map", "a", 5))
+    assert not copy.note("a", (1, OTHER), moving("map", "a", 4))
+    assert copy.note("a", (1, OTHER), moving("map", "a", 6))
+    assert not copy.note("a", (1, OTHER), None)
 
 
-def test_removals_take_no_room_of_frames() -> None:
-    replica = Replica(2, OWN)
+def test_removals_take_no_room_of_frames_and_all_origins_together_have_a_bound() -> None:
+    copy = Copy(2)
     for number in range(3 * MANY_ORIGINS):
         for sample in (static("map", f"{number}"), None):
-            replica.note(f"{number}", (2 * number + (sample is None), OTHER), sample)
-    replica.note("a", (10**6, OTHER), static("map", "a"))
-    replica.note("b", (10**6, OTHER), static("map", "b"))
-    for _ in range(MOST_REMOVALS):
+            copy.note(f"{number}", (2 * number + (sample is None), OTHER), sample)
+    copy.note("a", (10**6, OTHER), static("map", "a"))
+    copy.note("b", (10**6, OTHER), static("map", "b"))
+    for _ in range(100):
         with pytest.raises(TooManyEntriesError):
-            replica.note("0", (10**6, OTHER), static("map", "0"))
+            copy.note("0", (10**6, OTHER), static("map", "0"))
+    taken = 2
+    for number in range(50):
+        with suppress(TooManyEntriesError):
+            taken += copy.note(f"of {number}", (1, number.to_bytes(16, "big")), static("map", f"of {number}"))
+    assert taken == 2 * MANY_ORIGINS
     for number in range(MOST_REMOVALS + 1):
-        replica.note(f"more {number}", (10**6 + number, OTHER), None)
-    assert len(replica.entries) == MOST_REMOVALS + 2
+        copy.note(f"more {number}", (10**6 + number, OTHER), None)
+    assert len(copy.ranks) == MOST_REMOVALS + taken
 
 
 def test_copies_forget_the_same_removals_in_whatever_order_they_come() -> None:
     removals = [(f"f{number}", (number, OTHER)) for number in range(MOST_REMOVALS + 2_000)]
     copies = []
     for seed in range(2):
-        replica = Replica(10, OWN)
+        copy = Copy()
         random.Random(seed).shuffle(removals)
         for place, (frame, rank) in enumerate(removals):
-            replica.note(frame, rank, None)
+            copy.note(frame, rank, None)
             if place % 1_000 == seed:
-                replica.claim(place)
-        copies.append(replica)
+                copy.claim(place)
+        copies.append(copy)
     expected = {f"f{number}" for number in range(2_000, MOST_REMOVALS + 2_000)}
-    assert [set(replica.entries) for replica in copies] == [expected, expected]
+    assert [set(copy.ranks) for copy in copies] == [expected, expected]
     assert copies[0].claim(1e6).digest == copies[1].claim(1e6).digest
     told = set()
     claim = Claim(0, 0, 0, final=False)
@@ -91,6 +119,25 @@ def test_copies_forget_the_same_removals_in_whatever_order_they_come() -> None:
         chunk, claim = copies[0].changes(claim.sequence, 1e6)
         told |= {entry.frame for entry in chunk if isinstance(entry, RemovedFrame)}
     assert told == expected
+
+
+def test_views_of_one_copy_agree_with_copies_of_their_own_frames_and_a_frame_that_is_brought_on_stays() -> None:
+    both, left, right = Replica(), filled(["l", "x"]), filled(["r", "x"])
+    views = View(both), View(both)
+    for view, frame in zip((*views, *views), ("l", "r", "x", "x"), strict=True):
+        before = both.sequence
+        both.note(frame, Provenance(OTHER, 1), static("map", frame), view.route)
+        # Also a frame that the other view has is told since then.
+        assert len(view.changes(before, 0.0)[0]) == 1
+    assert [view.claim(0.0).digest for view in views] == [copy.claim(0.0).digest for copy in (left, right)]
+    both.note("x", Provenance(OTHER, 2), static("map", "x"), views[0].route)
+    for copy in (left, right):
+        copy.note("x", (2, OTHER), static("map", "x"))
+    assert [view.claim(0.0).digest for view in views] == [copy.claim(0.0).digest for copy in (left, right)]
+    assert [len(view.changes(0, 0.0)[0]) for view in views] == [2, 2]
+    both.narrow([views[0]], keep_removals=True)
+    assert set(both.entries) == {"r", "x"}
+    assert views[1].claim(0.0).digest == right.claim(0.0).digest
 
 
 # The next question
@@ -103,19 +150,19 @@ class Asker:
         random.seed(1)
         self.now = 0.0
         self.is_behind = False
-        self.replica = Replica(1_000, OWN)
+        self.copy = Copy(1_000)
         self.agreement = Agreement()
-        self.peers = {peer: Replica(1_000, peer.encode()) for peer in peers}
+        self.peers = {peer: Copy(1_000) for peer in peers}
         self.number = 0
         for peer in peers:
-            self.agreement.joined(peer, self.replica, self.now)
+            self.agreement.joined(peer, self.copy, self.now)
 
     def say(self, *peers: str, heard: bool = True) -> None:
         """Some peers hold a new entry; the link hears it live, or does not."""
         self.number += 1
         frame, rank = f"f{self.number}", (self.number, OTHER)
-        for replica in [self.peers[peer] for peer in peers] + [self.replica] * heard:
-            replica.note(frame, rank, static("map", frame))
+        for copy in [self.peers[peer] for peer in peers] + [self.copy] * heard:
+            copy.note(frame, rank, static("map", frame))
 
     def sign(self, peer: str) -> None:
         self.agreement.told(peer, self.peers[peer].claim(self.now), self.now)
@@ -132,7 +179,7 @@ class Asker:
 
     def answer(self, question: Question, limit: int = CHUNK) -> Claim:
         told, claim = self.peers[question.peer].changes(question.since, self.now, limit=limit)
-        news = [self.replica.note(frame, rank, static("map", frame)) for frame, rank in map(self._rank, told)]
+        news = [self.copy.note(frame, rank, static("map", frame)) for frame, rank in map(self._rank, told)]
         self.agreement.answered(question.peer, claim, any(news), self.now)
         return claim
 
@@ -148,28 +195,28 @@ def test_a_peer_that_comes_back_is_asked_for_what_is_new() -> None:
     link.answer(link.next_question() or Question("", 0))
     link.agreement.left("a")
     link.say("a", heard=False)
-    link.agreement.joined("a", link.replica, link.now)
+    link.agreement.joined("a", link.copy, link.now)
     link.sign("a")
     question = link.next_question()
     assert question == Question("a", 1)
     link.answer(question)
     # It may have begun anew meanwhile.
     link.agreement.left("a")
-    link.peers["a"] = Replica(10, b"a")
+    link.peers["a"] = Copy(10)
     link.say("a", heard=False)
-    link.agreement.joined("a", link.replica, link.now, must_ask=True)
+    link.agreement.joined("a", link.copy, link.now, must_ask=True)
     question = link.next_question()
     assert question == Question("a", 2)
     assert link.answer(question).since == 0
-    assert ranks_in(link.replica).items() >= ranks_in(link.peers["a"]).items()
+    assert link.copy.ranks.items() >= link.peers["a"].ranks.items()
     for number in range(MOST_REMEMBERED + 1):
-        link.agreement.joined(f"{number}", link.replica, link.now, must_ask=True)
+        link.agreement.joined(f"{number}", link.copy, link.now, must_ask=True)
         asked = link.next_question()
         assert asked is not None
         link.agreement.answered(asked.peer, Claim(0, 5, 0), True, link.now)
         link.agreement.left(asked.peer)
     for peer, since in (("0", 0), ("1", 5), (f"{MOST_REMEMBERED}", 5)):
-        link.agreement.joined(peer, link.replica, link.now, must_ask=True)
+        link.agreement.joined(peer, link.copy, link.now, must_ask=True)
         assert link.next_question() == Question(peer, since)
         link.agreement.left(peer)
 
@@ -223,7 +270,7 @@ def test_a_silent_peer_without_a_sign_of_life_is_asked_ever_less_often_and_other
     assert found[0] == 0.0
     assert all(0.6 * 2**count <= pause or pause > 59.9 for count, pause in enumerate(found[1:]))
     assert 59.9 < max(found) < 60.1
-    link.agreement.joined("b", link.replica, link.now, must_ask=True)
+    link.agreement.joined("b", link.copy, link.now, must_ask=True)
     assert link.next_question(0.0) == Question("b", 0)
 
 

@@ -15,8 +15,8 @@ from support.samples import moving, static
 from tfbus import PeerLost, PeerRejected, TransformStamped
 from tfbus.links.endpoint import MAX_AUTHORITIES
 from tfbus.links.message import Kind, Outgoing, read_message, write_body, write_message, write_text
-from tfbus.links.relay import LARGEST_JUMP, OutgoingBatch, RemovedFrame
-from tfbus.links.replica import MANY_ORIGINS, Claim
+from tfbus.links.relay import LARGEST_JUMP
+from tfbus.links.replica import MANY_ORIGINS, Claim, OutgoingBatch, RemovedFrame
 
 HERE, OTHER, THIRD = b"the stranger's..", b"one more origin.", b"and a third one."
 

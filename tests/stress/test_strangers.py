@@ -4,7 +4,7 @@ import json
 import struct
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from random import Random
 from typing import Any, NamedTuple
 
@@ -39,8 +39,13 @@ from tfbus.links.message import (
     write_question,
     write_text,
 )
-from tfbus.links.relay import Entry, OutgoingBatch, ReceivedBatch, RemovedFrame
-from tfbus.links.replica import MANY_ORIGINS, MOST_REMOVALS, Claim, Places, Replica, TooManyEntriesError
+from tfbus.links.replica import (
+    Claim,
+    Entry,
+    OutgoingBatch,
+    ReceivedBatch,
+    RemovedFrame,
+)
 from tfbus.links.seams import Hearing, Joined, Left
 
 pytestmark = pytest.mark.anyio
@@ -393,31 +398,12 @@ async def test_whatever_a_stranger_says_the_others_agree_and_what_is_refused_is_
 # Defects that were found
 
 
-@pytest.mark.thorough
-def test_all_copies_of_a_link_together_have_so_many_frames_and_removals() -> None:
-    places = Places(10)
-    copies = [Replica(10, b"own", places) for _ in range(50)]
-    taken = 0
-    for number, copy in enumerate(copies):
-        for k in range(8):
-            with suppress(TooManyEntriesError):
-                taken += copy.note(f"f{k}", (1, number.to_bytes(16, "big")), static("map", f"f{k}"))
-        for k in range(MOST_REMOVALS):
-            copy.note(f"r{k}", (k, BUS), None)
-    assert taken == MANY_ORIGINS * 10
-    assert sum(len(copy.entries) for copy in copies) <= taken + MANY_ORIGINS * MOST_REMOVALS
-    # A copy that is forgotten makes room.
-    for copy in copies:
-        copy.forget()
-    assert copies[0].note("f", (1, BUS), static("map", "f"))
-
-
 def test_messages_of_large_batches_do_not_wait_for_the_past_beyond_a_bound() -> None:
     asker = HistoryAsker(5.0, lambda *_: None, lambda: 0.0)
     asker.joined("one")
     asker.joined("other")
     samples = [moving("map", "arm", stamp) for stamp in range(1_000)]
-    heard = Heard(Kind.LIVE, BUS, 1, entries=[ReceivedBatch(samples, (), BUS, 1)])  # type: ignore[arg-type]
+    heard = Heard(Kind.LIVE, BUS, 1, entries=[ReceivedBatch(BUS, 1, samples)])
     held = sum(asker.holds("one", heard) + asker.holds("other", heard) for _ in range(500))
     assert held == MOST_HELD_SAMPLES // 1_001
     asker.end("one")

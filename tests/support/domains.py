@@ -16,11 +16,12 @@ from support.foreign_world import ForeignCarrier, ForeignMessage, ForeignWorld
 from tfbus import Bus, SimulatedClock, Transform, TransformStamped, UnknownFrameError
 from tfbus.geometry.stamped import Batch
 from tfbus.links.domain import DomainEnd
-from tfbus.links.endpoint import Endpoint, ForeignEnd
+from tfbus.links.endpoint import Endpoint
 from tfbus.links.link import ReceiveQueue
 from tfbus.links.message import NOTHING, Kind, Outgoing, kind_of, write_message
-from tfbus.links.relay import OutgoingBatch, RemovedFrame, relay_of
-from tfbus.links.replica import Claim
+from tfbus.links.relay import relay_of
+from tfbus.links.replica import Claim, OutgoingBatch, RemovedFrame
+from tfbus.links.ros.foreign_end import ForeignEnd
 from tfbus.links.seams import Hearing, Joined, Left, Receive, Received, WireItem
 from tfbus.tf_message import MalformedMessageError
 
@@ -328,7 +329,7 @@ class Process:
         self.world = world
         self.bus = Bus(SimulatedClock(int(world.now * SECOND)), max_ahead=None)
         # The relay draws it elsewhere, and a run has to be given by its seed.
-        relay_of(self.bus).origin = world.random.randbytes(16)
+        relay_of(self.bus).replica.origin = world.random.randbytes(16)
         self.networks = networks
         self.name: str = options.pop("name", f"{next(world.names)}")
         self.drop_lost = drop_lost

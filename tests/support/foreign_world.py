@@ -4,8 +4,9 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from tfbus import InvalidTransformError, Transform, TransformStamped
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch, ReceivedTransform, Turn
-from tfbus.links.seams import Carrier, Received, ReceivedMessage, SendReport
+from tfbus.links.replica import OutgoingBatch, ReceivedTransform
+from tfbus.links.ros.foreign_end import Carrier, ReceivedMessage, Turn
+from tfbus.links.seams import Received, SendReport
 from tfbus.tf_message import MalformedMessageError
 
 
@@ -95,7 +96,7 @@ class ForeignCarrier(Carrier):
                 samples.append(ReceivedTransform(parent, child, stamp, transform, "foreign", content.static))
             except InvalidTransformError as error:
                 errors.append(error)
-        return ReceivedMessage([ReceivedBatch(samples, {"foreign"})], errors=errors)
+        return ReceivedMessage(samples, errors=errors)
 
     async def run(self) -> None:
         """Nothing takes time."""

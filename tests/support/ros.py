@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from typing import Unpack
 
 from tfbus import Bus, SimulatedClock, TransformStamped
-from tfbus.links.endpoint import ForeignEnd
 from tfbus.links.ros import RosOptions
+from tfbus.links.ros.foreign_end import ForeignEnd
 from tfbus.links.ros.ros_link import RosCarrier, RosMessage
 from tfbus.links.ros.settings import settings_of
 from tfbus.links.seams import Joined, Left, Received, SendReport

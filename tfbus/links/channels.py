@@ -18,8 +18,7 @@ from tfbus.links.message import (
     Way,
     write_message,
 )
-from tfbus.links.relay import Entry, OutgoingBatch, RemovedFrame, Turn
-from tfbus.links.replica import Replica, hash_bytes
+from tfbus.links.replica import Entry, OutgoingBatch, RemovedFrame, View, hash_bytes
 from tfbus.links.seams import SendReport, Wire
 
 ALL: Final = "all"
@@ -92,28 +91,28 @@ class Channels:
             heard = filter(self._wire.is_heard, self._all.names[1:])
             self._all.names = [ALL, *heard, name][: 1 + MAX_PEERS]
 
-    def send(self, turn: Turn, now: float) -> None:
-        """Publish what one turn has gathered."""
-        if turn.time is not None:
-            self._time = turn.time
+    def send(self, gathered: Sequence[Entry], time: int | None, now: float) -> None:
+        """Publish what one turn has gathered, and the time of the clock if it has to be told."""
+        if time is not None:
+            self._time = time
         for channel in list(self._channels):
             if channel is self._slow:
-                self._note_newest(turn.entries, now)
+                self._note_newest(gathered, now)
                 continue
-            parts = (entry.within(channel.frames) for entry in turn.entries)
+            parts = (entry.within(channel.frames) for entry in gathered)
             entries = [part for part in parts if part is not None]
-            if not entries and turn.time is None:
+            if not entries and time is None:
                 continue
             if self._is_heard(channel, now):
                 self._write(channel, entries)
             else:
                 channel.number += 1
 
-    def sign(self, replica: Replica, now: float, reach: Sequence[Way], serves: bool) -> None:
+    def sign(self, view: View, now: float, reach: Sequence[Way], serves: bool) -> None:
         """Publish a sign of life on each channel."""
         for channel in list(self._channels):
             if self._is_heard(channel, now):
-                claim = replica.claim(now, channel.frames)._replace(partial=self._partial)
+                claim = view.claim(now, channel.frames)._replace(partial=self._partial)
                 sign = Outgoing(Kind.SIGN, self._bus, channel.number, claim, self._time, reach, serves)
                 first, *others = channel.names
                 self._wire.publish(first, write_message(sign))

@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
+from itertools import islice
 from math import inf
 from time import monotonic
 from typing import Any, TypedDict
@@ -26,16 +27,19 @@ from tfbus.links.message import (
     write_message,
     write_text,
 )
-from tfbus.links.relay import (
+from tfbus.links.relay import Peer
+from tfbus.links.replica import (
+    CHUNK,
+    Agreement,
+    Claim,
     Entry,
-    Peer,
     Provenance,
     ReceivedBatch,
     ReceivedTransform,
     RemovedFrame,
-    Turn,
+    TooManyEntriesError,
+    View,
 )
-from tfbus.links.replica import CHUNK, Agreement, Claim, Known, Places, Replica, TooManyEntriesError
 from tfbus.links.seams import Hearing, Joined, Left, Received, Wire, WireItem
 from tfbus.stamps import as_duration
 from tfbus.tf_message import MalformedMessageError
@@ -88,10 +92,12 @@ class DomainEnd(Endpoint):
 
     Attributes
     ----------
-    own : Replica
-        The copy of what the links of this robot bring.
+    own : View
+        The frames that the links of this robot bring.
     lookups : RemoteLookups
     """
+
+    own: View
 
     def __init__(
         self,
@@ -129,10 +135,9 @@ class DomainEnd(Endpoint):
         self._filters = channel != ALL
         channels = {inf: channel, 0.0: QUIET}
         self._rates = {Hearing(pattern, channels.get(rate, SLOW)): rate for pattern, rate in rates.items()}
-        self._channels = Channels(wire, self.relay.origin, self.frames is not None, slow_rate, self.report)
-        self._places = Places(self.max_frames)
-        self._replicas: dict[str, Replica] = {}
-        self.own: Replica = self._replica_of(self._robot)
+        self._bus = self.relay.replica.origin
+        self._channels = Channels(wire, self._bus, self.frames is not None, slow_rate, self.report)
+        self.own: View = self._view_of(self._robot)
         self._agreement = Agreement()
         self._history = HistoryAsker(history or 0.0, wire.send, now)
         self.lookups: RemoteLookups = RemoteLookups(wire.send, name)
@@ -156,9 +161,7 @@ class DomainEnd(Endpoint):
 
     def detach(self) -> None:
         self.lookups.close()
-        peers = list(self.peers.values())
-        self.peers.clear()
-        for peer in peers:
+        for peer in list(self.peers.values()):
             self._forget(peer)
         self.relay.detach(self)
 
@@ -207,9 +210,10 @@ class DomainEnd(Endpoint):
 
     # For its parts
 
-    def sign_soon(self) -> None:
-        """Sign in the next turn of the event loop, or `SOONEST_SIGN` after the last sign."""
-        self._sign_within(SOONEST_SIGN)
+    def sign_soon(self, seconds: float = SOONEST_SIGN) -> None:
+        """Sign so many seconds after the last sign, or in the next turn of the event loop, if no sign is due before."""
+        self._sign_due = min(self._sign_due, self._signed_at + seconds)
+        self.host.stir()
 
     def serve(self, server: BufferServer | None) -> None:
         """Serve a buffer, or none any more."""
@@ -217,22 +221,6 @@ class DomainEnd(Endpoint):
         self.sign_soon()
 
     # For the relay
-
-    keeps_withdrawn = True
-
-    def keep(self, entry: Entry) -> None:
-        rank, wanted = (entry.sequence, entry.origin), entry.within(self.frames)
-        if isinstance(wanted, RemovedFrame):
-            self.own.note(wanted.frame, rank, None, ours=True)
-            return
-        for sample in () if wanted is None else wanted.samples:
-            _, child, _, _, _, static = sample._fields
-            with suppress(TooManyEntriesError):
-                self.own.note(child, rank, sample, ours=True, settles=not static)
-
-    def kept(self) -> Iterator[Entry]:
-        for replica in self._replicas.values():
-            yield from replica.told()
 
     def ways(self) -> Iterator[Way]:
         for peer in self.peers.values():
@@ -245,26 +233,18 @@ class DomainEnd(Endpoint):
         wanted = super().outgoing(entry)
         return None if wanted is None else sendable(wanted, self.report.refused)
 
-    def _follow(self, entry: Entry, goes_out: bool) -> bool:
-        if goes_out:
-            self.keep(entry)
-        return False
-
     # Going out
 
-    def _send(self, turn: Turn) -> None:
-        self._channels.send(turn, self._now())
-        self._sign_sooner()
+    def _send(self, entries: Sequence[Entry], time: int | None) -> None:
+        if entries or time is not None:
+            self._channels.send(entries, time, self._now())
+            self._sign_sooner()
 
     def _sign_sooner(self) -> None:
         period = max(SIGN_PERIOD, SIGN_PERIOD_EACH * len(self.peers))
         if period < self._sign_period:
             self._sign_period = period
-            self._sign_within(period)
-
-    def _sign_within(self, seconds: float) -> None:
-        self._sign_due = min(self._sign_due, self._signed_at + seconds)
-        self.host.stir()
+            self.sign_soon(period)
 
     def _sign(self, now: float) -> None:
         self._signed_at, self._sign_due = now, now + self._sign_period
@@ -279,10 +259,10 @@ class DomainEnd(Endpoint):
         """Send a new peer the entries that this link brings, or an empty meeting if they are too many."""
         self.send()
         claim = self.own.claim(self._now())._replace(partial=self.frames is not None)
-        out = Outgoing(Kind.MEETING, self.relay.origin, 0, claim, self.time, self._reach(), self._serves)
-        entries: Sequence[Entry] = self.own.ours(CHUNK) or ()
+        out = Outgoing(Kind.MEETING, self._bus, 0, claim, self.time, self._reach(), self._serves)
+        entries = [known.told for known in islice(self.own.brought(self), CHUNK + 1)]
         try:
-            message = write_message(out, entries)
+            message = write_message(out, entries if len(entries) <= CHUNK else ())
         except ValueError:
             message = write_message(out)
         self._wire.send(peer.id, message)
@@ -310,7 +290,7 @@ class DomainEnd(Endpoint):
             # A robot of rate 0 only answers lookups.
             if peer.rate:
                 # A peer hears of a filter by the first question.
-                self._agreement.joined(sender, self._replica_of(peer.robot), self._now(), must_ask=self._filters)
+                self._agreement.joined(sender, self._view_of(peer.robot), self._now(), must_ask=self._filters)
                 self._history.joined(sender)
             self.host.stir()
         elif sender not in self.peers and len(self._waiting) < MOST_WAITING:
@@ -393,89 +373,85 @@ class DomainEnd(Endpoint):
         """Note and publish the entries of a message; returns whether any of them was news."""
         for error in heard.errors:
             self.reject(peer.id, error.reason, error)
-        replica, live = self._replica_of(peer.robot), heard.kind is Kind.LIVE
-        news = False
-        together: list[tuple[Provenance, list[ReceivedTransform]]] = []
+        view, news = self._view_of(peer.robot), False
+        together: list[ReceivedTransform] = []
         for entry in heard.entries:
-            if isinstance(entry, RemovedFrame) and entry.within(self.frames) is None:
-                continue
-            assert entry.origin is not None
-            size = len(entry.samples) if isinstance(entry, ReceivedBatch) else 1
             if not self.relay.is_plausible(entry.sequence):
                 # It would make all later numbers of its origin old.
                 why = f"a batch with the number {entry.sequence}, which is too far ahead of all others"
-                self.reject(peer.id, "number", ValueError(why), size)
+                self.reject(peer.id, "number", ValueError(why), entry.size)
                 continue
-            provenance = Provenance(entry.origin, entry.sequence, self, peer)
+            self.relay.heard(entry.sequence)
+            source = Provenance(entry.origin, entry.sequence, self, peer)
             if isinstance(entry, ReceivedBatch):
                 # The authorities of a bus beyond the peer do not count as the peer's.
-                others = entry.origin not in peer.paths
-                if not others and not self._admit_authorities(peer, entry.authorities, size):
+                if entry.origin in peer.paths and not self._admit_authorities(peer, entry.samples):
                     continue
-                samples = self._wanted(entry.samples)
-                if heard.kind is not Kind.PAST:
-                    samples = self._note(replica, provenance, samples, live)
-                news = news or bool(samples)
-                together.append((provenance, samples))
+                is_new, admitted = self._judge(peer, view, source, entry.samples, heard.kind)
+                news = news or is_new
+                together += admitted
                 # The batches of an answer were never one batch, but nothing is between them.
-                if not live:
+                if heard.kind is not Kind.LIVE:
                     continue
-            self._publish(peer, together, heard.kind)
-            together.clear()
+            self._publish(together, heard.kind)
+            together = []
             if self.bus.closed:
                 # A subscriber may have closed it since the last entry.
                 return news
-            if isinstance(entry, RemovedFrame) and replica.note(entry.frame, provenance.rank, None):
-                self.relay.remove(provenance, entry.frame)
-                news = True
-        self._publish(peer, together, heard.kind)
+            if isinstance(entry, RemovedFrame):
+                news = self._remove(view, source, entry.frame) or news
+        self._publish(together, heard.kind)
         return news
 
-    def _note(
-        self, replica: Replica, provenance: Provenance, samples: list[ReceivedTransform], live: bool
-    ) -> list[ReceivedTransform]:
-        """Note the samples of a batch in a copy; returns the samples that the relay has to judge."""
-        rank, peer = provenance.rank, provenance.peer
-        kept: list[ReceivedTransform] = []
+    def _remove(self, view: View, source: Provenance, frame: str) -> bool:
+        """Note a removal; returns whether it was news for the map."""
+        is_news = view.holds(frame) and self.relay.replica.note(frame, source, None, view.route)
+        if is_news:
+            self.relay.remove(frame, source)
+        return is_news
+
+    def _judge(
+        self, peer: Peer, view: View, source: Provenance, samples: Iterable[ReceivedTransform], kind: Kind
+    ) -> tuple[bool, list[ReceivedTransform]]:
+        """Note the samples of a batch; returns whether any was news for the map, and those to publish."""
+        replica, live = self.relay.replica, kind is Kind.LIVE
+        hides = self.drop_lost and not self.relay.reaches(source.origin)
+        # The newest sample of a moving frame would make its past no news.
+        waits = bool(self._history.open) and kind not in (Kind.LIVE, Kind.PAST)
+        admitted: list[ReceivedTransform] = []
+        news = False
         for sample in samples:
             _, child, _, _, _, static = sample._fields
+            if not view.holds(child):
+                continue
+            moves = live and not static
             try:
-                is_new = replica.note(child, rank, sample, settles=live and not static)
+                is_new = replica.note(child, source, sample, view.route, max_frames=self.max_frames, settles=moves)
             except TooManyEntriesError as error:
-                assert peer is not None
                 self.reject(peer.id, "too many frames", error)
                 continue
-            # A late live sample of a moving frame belongs to its history; the relay knows which samples came before.
-            if is_new or (live and not static and self._shows_moving(replica.entries[child])):
-                kept.append(sample)
-        return kept
+            known = replica.entries[child]
+            # A late live sample of a moving frame belongs to its history, as the past does.
+            is_late = moves and known.shown is not None and known.sample is not None and not known.sample.static
+            if not (is_new or is_late or kind is Kind.PAST):
+                continue
+            news = True
+            if hides:
+                if known.shown is not None and known.shown.rank < source.rank:
+                    self.relay.remove(child, None)
+            elif not (waits and not static):
+                if self.relay.is_news(known, sample, source):
+                    admitted.append(sample)
+                else:
+                    self.duplicates += 1
+        self.relay.admit(admitted, source)
+        return news, admitted
 
-    def _shows_moving(self, entry: Known) -> bool:
-        """Whether the bus shows the frame of an entry, and it moves."""
-        is_shown = not self.drop_lost or self.relay.reaches(entry.origin)
-        return is_shown and entry.sample is not None and not entry.sample.static
-
-    def _wanted(self, samples: list[ReceivedTransform]) -> list[ReceivedTransform]:
-        frames = self.frames
-        return samples if frames is None else [sample for sample in samples if sample._fields[1] in frames]
-
-    def _publish(
-        self, peer: Peer, batches: Sequence[tuple[Provenance, Sequence[ReceivedTransform]]], kind: Kind
-    ) -> None:
-        if self._history.open and kind not in (Kind.LIVE, Kind.PAST):
-            # The newest sample of a moving frame would make its past no news.
-            batches = [(source, [sample for sample in samples if sample.static]) for source, samples in batches]
-        if self.drop_lost:
-            for source, samples in batches:
-                if not self.relay.reaches(source.origin):
-                    self.relay.mask(source, samples)
-            batches = [(source, samples) for source, samples in batches if self.relay.reaches(source.origin)]
-        offered = sum(len(samples) for _, samples in batches)
-        if not offered:
-            return
-        with nullcontext() if kind is Kind.LIVE else self.bus._kept_samples():
-            published, refused = self.relay.publish(batches, self.max_frames)
-        self._count(peer.id, offered, published, refused)
+    def _publish(self, samples: list[ReceivedTransform], kind: Kind) -> None:
+        if samples and not self.bus.closed:
+            with nullcontext() if kind is Kind.LIVE else self.bus._kept_samples():
+                self.bus.publish(samples, invalid="drop")
+            self.samples += len(samples)
 
     def _count_gap(self, peer: Peer, number: int, live: bool) -> bool:
         """Count the live messages that are missing before this number; returns whether there are any."""
@@ -521,10 +497,13 @@ class DomainEnd(Endpoint):
     def _lose(self, peer: Peer) -> tuple[str, ...]:
         self._end_history(peer.id, peer)
         lost = self._forget(peer)
-        frames = tuple(self.relay.frames_of(lost))
-        if self.drop_lost:
-            self.relay.withdraw(frames, lost)
+        frames = tuple(self.relay.frames_of(lambda source: source.origin in lost))
+        self._withdraw(lost)
         return frames
+
+    def _withdraw(self, lost: Collection[bytes]) -> None:
+        if self.drop_lost and lost:
+            self.relay.withdraw(lambda source: source.origin in lost)
 
     def _forget(self, peer: Peer) -> set[bytes]:
         """Forget a peer; returns the buses that are no longer reached."""
@@ -533,14 +512,12 @@ class DomainEnd(Endpoint):
         self.lookups.left(peer.id)
         self._resting.pop(peer.id, None)
         self._forget_robots(peer.robot)
-        lost = {bus for bus in peer.paths if self.relay.way_closed(bus)}
-        if peer.paths:
-            self.relay.reach_changed(self)
+        _, lost = self.relay.reach_changed(self) if peer.paths else ((), set[bytes]())
         return lost
 
     def _update_ways(self, peer: Peer, heard: Heard) -> None:
         """Note the buses that a peer leads to: its own bus, and those in its sign."""
-        own = self.relay.origin
+        own = self._bus
         if heard.kind in (Kind.SIGN, Kind.MEETING):
             told = {bus: (heard.bus, *path) for bus, path in heard.reach if bus != own and own not in path}
             paths = {heard.bus: (), **{bus: path for bus, path in told.items() if bus != heard.bus}}
@@ -551,38 +528,33 @@ class DomainEnd(Endpoint):
         paths.pop(own, None)
         if paths == peer.paths:
             return
-        before, peer.paths = peer.paths, paths
-        opened = [bus for bus in paths if bus not in before and not self.relay.reaches(bus)]
-        for bus in paths.keys() - before.keys():
-            self.relay.way_opened(bus)
-        lost = {bus for bus in before.keys() - paths.keys() if self.relay.way_closed(bus)}
-        self.relay.reach_changed(self)
-        if self.drop_lost:
-            self.relay.withdraw(self.relay.frames_of(lost), lost)
-            if opened:
-                self._show(peer, set(opened))
+        peer.paths = paths
+        opened, lost = self.relay.reach_changed(self)
+        self._withdraw(lost)
+        if self.drop_lost and opened:
+            self._show()
 
-    def _show(self, peer: Peer, buses: Collection[bytes] | None = None) -> None:
-        """Publish the entries of some buses that are reached again, or of all."""
-        batches = [
-            (Provenance(entry.origin, entry.number, self, peer), [entry.sample])
-            for replica in self._replicas.values()
-            for entry in replica.entries.values()
-            if (buses is None or entry.origin in buses) and isinstance(entry.sample, ReceivedTransform)
-        ]
-        self._publish(peer, batches, Kind.ANSWER)
+    def _show(self) -> None:
+        """Publish the entries that were kept from the bus, as far as their buses are reached now."""
+        found: list[ReceivedTransform] = []
+        for known in self.relay.replica.entries.values():
+            sample, source = known.sample, known.source
+            is_here = not self.drop_lost or self.relay.reaches(source.origin)
+            if is_here and isinstance(sample, ReceivedTransform) and self.relay.is_news(known, sample, source):
+                self.relay.admit([sample], source)
+                found.append(sample)
+        self._publish(found, Kind.ANSWER)
 
     # Answers
 
     def _answer(self, sender: str, fields: dict[str, Any]) -> None:
         since, names = fields.get("since"), fields.get("frames")
-        frames = None
         if type(since) is not int or not 0 <= since < 2**64:
             raise MalformedMessageError("text", f"a question since {since!r}"[:100])
-        if names is not None:
-            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-                raise MalformedMessageError("text", "a filter without names")
-            frames = frozenset(names)
+        if not isinstance(names, list | None) or not all(isinstance(name, str) for name in names or ()):
+            raise MalformedMessageError("text", "a filter without names")
+        frames = None if names is None else frozenset(names)
+        if frames is not None:
             if self.frames is None or frames <= self.frames:
                 self._agreement.filters(sender, frames)
             self._channels.serve(frames, self._now())
@@ -590,7 +562,7 @@ class DomainEnd(Endpoint):
         while limit:
             entries, claim = self.own.changes(since, self._now(), frames, limit)
             claim = claim._replace(partial=self.frames is not None)
-            out = Outgoing(Kind.ANSWER, self.relay.origin, 0, claim, None, self._reach())
+            out = Outgoing(Kind.ANSWER, self._bus, 0, claim, None, self._reach())
             try:
                 message = write_message(out, entries)
             except ValueError:
@@ -603,8 +575,8 @@ class DomainEnd(Endpoint):
         seconds, after = fields.get("seconds"), fields.get("after")
         if isinstance(seconds, bool) or not isinstance(seconds, (int, float)) or not isinstance(after, str):
             raise MalformedMessageError("text", "a question for the past without a time and a name")
-        entries, final = chunk_of_past(self.bus, self.own, seconds, after)
-        out = Outgoing(Kind.PAST, self.relay.origin, 0, Claim(0, 0, 0, final))
+        entries, final = chunk_of_past(self.bus, self.own.brought(self), seconds, after)
+        out = Outgoing(Kind.PAST, self._bus, 0, Claim(0, 0, 0, final))
         self._wire.send(sender, write_message(out, entries))
 
     def _end_history(self, peer: str, lost: Peer | None = None) -> None:
@@ -615,7 +587,7 @@ class DomainEnd(Endpoint):
             if known is not None:
                 if not self._history.open:
                     # The newest samples of frames without a past were not published yet.
-                    self._show(known)
+                    self._show()
                 for heard in held:
                     self._take_held(known, heard)
 
@@ -625,23 +597,24 @@ class DomainEnd(Endpoint):
     def _serves(self) -> bool:
         return self.lookups.server is not None
 
-    def _replica_of(self, robot: str) -> Replica:
-        replica = self._replicas.get(robot)
-        if replica is None:
-            replica = self._replicas[robot] = Replica(self.max_frames, self.relay.origin, self._places)
-        return replica
+    def _view_of(self, robot: str) -> View:
+        view = self.views.get(robot)
+        if view is None:
+            view = self.views[robot] = View(self.relay.replica, self.frames)
+            self.relay.route()
+        return view
 
     def _forget_robots(self, gone: str) -> None:
-        """Forget the copies of the robots that have gone first, if many have gone."""
-        replica = self._replicas.get(gone)
-        if replica is None or len(self._replicas) <= MOST_ROBOTS:
+        """Forget what the robots brought that have gone first, if many have gone."""
+        if gone not in self.views or len(self.views) <= MOST_ROBOTS:
             return
-        # Buses that have come or gone last are the last.
-        self._replicas[gone] = self._replicas.pop(gone)
+        # Robots that have come or gone last are the last.
+        self.views[gone] = self.views.pop(gone)
         here = {peer.robot for peer in self.peers.values()} | {self._robot}
-        absent = [robot for robot in self._replicas if robot not in here]
-        for robot in absent[: max(len(absent) - MOST_ROBOTS, 0)]:
-            self._replicas.pop(robot).forget()
+        absent = [robot for robot in self.views if robot not in here]
+        forgotten = [self.views.pop(robot) for robot in absent[: max(len(absent) - MOST_ROBOTS, 0)]]
+        if forgotten:
+            self.relay.replica.narrow(forgotten, keep_removals=True)
 
 
 class _Due(Text):

@@ -1,13 +1,13 @@
 """One end of a link without its event loop: it publishes what peers have sent, within limits, and tells of them.
 
-`ForeignEnd` is the end of a link to another world, over a carrier; `tfbus.links.domain.DomainEnd` that of a link of
-tfbus, over a wire. Nothing that a peer sends makes either of them raise.
+`tfbus.links.domain.DomainEnd` is the end of a link of tfbus, `tfbus.links.ros.foreign_end.ForeignEnd` that of a link to
+another world. Nothing that a peer sends makes either of them raise.
 """
 
 import logging
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from copy import copy
 from math import inf
 from typing import Any, Protocol
@@ -16,8 +16,9 @@ from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import OnceLogger, SeenKeys
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import REMEMBERED_REASONS, Entry, Outbox, Peer, Relay, RemovedFrame, Turn, relay_of
-from tfbus.links.seams import Carrier, Joined, Left, Received, SendReport, Wire
+from tfbus.links.relay import REMEMBERED_REASONS, Outbox, Peer, Relay, relay_of
+from tfbus.links.replica import Entry
+from tfbus.links.seams import Joined, Left, Received, SendReport
 from tfbus.tf_message import MalformedMessageError
 
 MAX_PEERS = 1_000
@@ -49,6 +50,18 @@ class Host(Protocol):
         """Call `Endpoint.work` earlier than at the time that it has returned."""
 
 
+class Network(Protocol):
+    """The wire or the carrier below an end."""
+
+    id: str
+
+    async def run(self) -> None:
+        """Do what takes time, until cancelled."""
+
+    async def close(self) -> None:
+        """Disconnect."""
+
+
 class Endpoint(Outbox, ABC):
     """The bus's end of a link.
 
@@ -57,7 +70,7 @@ class Endpoint(Outbox, ABC):
     bus : Bus
     name : str
         How events and log lines call the link.
-    network : Wire or Carrier
+    network : Network
     frames : iterable of str or None
         The children that go out and come in; None for all.
     drop_lost : bool
@@ -94,7 +107,7 @@ class Endpoint(Outbox, ABC):
         self,
         bus: Bus,
         name: str,
-        network: Wire | Carrier,
+        network: Network,
         frames: Iterable[str] | None,
         drop_lost: bool,
         max_frames: int,
@@ -164,11 +177,10 @@ class Endpoint(Outbox, ABC):
 
     def send(self) -> None:
         """Hand the gathered entries to the network, if there are any."""
-        turn = Turn(self._entries, self._take_statics(), self.time if self._time_waits else None)
+        entries, time = self._entries, self.time if self._time_waits else None
         self._entries, self._time_waits = [], False
         self.pending: int = 0
-        if turn.entries or turn.statics or turn.time is not None:
-            self._send(turn)
+        self._send(entries, time)
 
     def work(self) -> float:
         """Do the work that is due; returns the time of the next call, in s of the monotonic clock."""
@@ -219,12 +231,8 @@ class Endpoint(Outbox, ABC):
     # For the two kinds of ends
 
     @abstractmethod
-    def _send(self, turn: Turn) -> None:
-        """Send what has gathered in a turn."""
-
-    def _take_statics(self) -> dict[str, TransformStamped | None]:
-        """The changes of static frames for late joiners."""
-        return {}
+    def _send(self, entries: Sequence[Entry], time: int | None) -> None:
+        """Send what one turn of the event loop has published and removed, and the time if it has to be told."""
 
     @abstractmethod
     def _take(self, sender: str, content: Any) -> None:
@@ -293,107 +301,17 @@ class Endpoint(Outbox, ABC):
     def _warn_not_sent(self, error: Exception) -> None:
         self._log.warning(str(error), "not sent over the link %s: %s", self.name, error)
 
-    def _admit_authorities(self, peer: Peer, authorities: Collection[str], samples: int) -> bool:
-        """Note the authorities that a batch names; returns False, and refuses the batch, if they are too many."""
-        for authority in authorities:
-            if authority not in peer.authorities:
-                text = peer.authority_text + len(authority)
-                if len(peer.authorities) >= MAX_AUTHORITIES or text > MOST_AUTHORITY_TEXT:
-                    error = ValueError(
-                        f"the peer has spoken for more than {MAX_AUTHORITIES} authorities, or for very long ones"
-                    )
-                    self.reject(peer.id, "too many authorities", error, samples)
-                    return False
-                peer.authorities.add(authority)
-                peer.authority_text = text
+    def _admit_authorities(self, peer: Peer, samples: Collection[TransformStamped]) -> bool:
+        """Note the authorities of a batch; returns False, and refuses the batch, if they are too many."""
+        for authority in {sample._fields[4] for sample in samples} - peer.authorities:
+            text = peer.authority_text + len(authority)
+            if len(peer.authorities) >= MAX_AUTHORITIES or text > MOST_AUTHORITY_TEXT:
+                why = f"the peer has spoken for more than {MAX_AUTHORITIES} authorities, or for very long ones"
+                self.reject(peer.id, "too many authorities", ValueError(why), len(samples))
+                return False
+            peer.authorities.add(authority)
+            peer.authority_text = text
         return True
 
     def _notify(self) -> None:
         self.host.send_soon(self.pending)
-
-
-class ForeignEnd(Endpoint):
-    """The end of a link to a world whose messages have neither origins nor numbers, such as ROS.
-
-    Such a world keeps messages with static frames for late joiners. If this link has sent a frame, and the world sends
-    a newer sample of it, the newer sample replaces the kept message.
-
-    Parameters
-    ----------
-    bus, name, frames, drop_lost, max_frames
-        As for `Endpoint`.
-    carrier : Carrier
-    """
-
-    def __init__(
-        self,
-        bus: Bus,
-        name: str,
-        carrier: Carrier,
-        frames: Iterable[str] | None = None,
-        drop_lost: bool = False,
-        max_frames: int = 10_000,
-    ) -> None:
-        super().__init__(bus, name, carrier, frames, drop_lost, max_frames)
-        self._carrier = carrier
-        self._latched: set[str] = set()
-        self._changes: dict[str, TransformStamped | None] = {}
-
-    async def open(self) -> None:
-        await self._carrier.open(self.host.receive, self.report)
-
-    def attach(self) -> None:
-        self.relay.attach(self, foreign=True)
-
-    def detach(self) -> None:
-        for peer in self.peers.values():
-            self.relay.lose_foreign(peer, self, drop=False)
-        self.peers.clear()
-        self.relay.detach(self)
-
-    def split(self, item: Received) -> Iterator[Any]:
-        return self._carrier.split(item.content)
-
-    def _send(self, turn: Turn) -> None:
-        self._carrier.send(turn)
-
-    def _lose(self, peer: Peer) -> tuple[str, ...]:
-        return self.relay.lose_foreign(peer, self, self.drop_lost)
-
-    def _take(self, sender: str, content: Any) -> None:
-        message = self._carrier.read(content)
-        if message.time is not None:
-            self._hear_time(sender, message.time)
-        peer = self._find(sender)
-        if peer is None or self.bus.closed:
-            return
-        if not message.continues:
-            self.messages += 1
-        for error in message.errors:
-            self.reject(sender, error.reason, error)
-        for batch in message.batches:
-            if self.bus.closed or not self._admit_authorities(peer, batch.authorities, len(batch.samples)):
-                continue
-            samples = batch.samples
-            if self.frames is not None:
-                samples = [sample for sample in samples if sample.child in self.frames]
-            published, refused = self.relay.publish_foreign(self, peer, samples, self.max_frames)
-            self._count(sender, len(samples), published, refused)
-
-    def _follow(self, entry: Entry, goes_out: bool) -> bool:
-        said: list[tuple[str, TransformStamped | None]]
-        if isinstance(entry, RemovedFrame):
-            said = [(entry.frame, None)]
-        else:
-            said = [(sample.child, sample if sample.static else None) for sample in entry.samples]
-        changed = False
-        for frame, latched in said:
-            if frame in self._latched or (goes_out and latched is not None):
-                (self._latched.discard if latched is None else self._latched.add)(frame)
-                self._changes[frame] = latched
-                changed = True
-        return changed
-
-    def _take_statics(self) -> dict[str, TransformStamped | None]:
-        changes, self._changes = self._changes, {}
-        return changes

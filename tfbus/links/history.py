@@ -5,7 +5,6 @@ meanwhile, so that the samples of each frame come in order. The answers have the
 frame, so a sample that comes both live and in an answer is published once.
 """
 
-from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from math import inf
@@ -13,10 +12,9 @@ from math import inf
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.message import Heard, Kind, write_text
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch
-from tfbus.links.replica import Replica
+from tfbus.links.replica import Known, OutgoingBatch, ReceivedBatch
 from tfbus.stamps import from_seconds
-from tfbus.tree.history import FrameHistory
+from tfbus.tree.history import samples_of
 
 CHUNK = 2_000
 """The most samples in one answer, unless a single frame has more."""
@@ -34,29 +32,29 @@ MOST_REMEMBERED = 10_000
 """The most peers that are remembered as asked."""
 
 
-def chunk_of_past(bus: Bus, replica: Replica, seconds: float, after: str) -> tuple[list[OutgoingBatch], bool]:
+def chunk_of_past(bus: Bus, brought: Iterable[Known], seconds: float, after: str) -> tuple[list[OutgoingBatch], bool]:
     """The moving samples of the last seconds that a link tells to a peer, and whether these are all.
 
     Parameters
     ----------
     bus : Bus
         Its buffers hold the samples.
-    replica : Replica
-        The copy of the frames that the link brings.
+    brought : iterable of Known
+        The frames that the link brings.
     seconds : float
     after : str
         The chunk begins with the first frame whose name comes after this one.
     """
-    frames = replica.moving()
+    moving = [known for known in brought if known.frame > after and known.sample and not known.sample.static]
     told: list[OutgoingBatch] = []
     count = 0
-    for place in range(bisect_right(frames, after), len(frames)):
-        newest, samples = replica.entries[frames[place]], _recent(bus, frames[place], seconds)
+    for known in sorted(moving, key=lambda known: known.frame):
+        samples = _recent(bus, known.frame, seconds)
         if not samples:
             continue
         if told and count + len(samples) > CHUNK:
             return told, False
-        told.append(OutgoingBatch(newest.origin, newest.number, samples))
+        told.append(OutgoingBatch(known.source.origin, known.source.sequence, samples))
         count += len(samples)
     return told, True
 
@@ -67,27 +65,12 @@ def _recent(bus: Bus, frame: str, seconds: float) -> list[TransformStamped]:
     histories = [history for history in held if history is not None and history.oldest is not None]
     if not histories:
         return []
-    history = min(histories, key=_oldest)
-    newest = history.newest
-    assert newest is not None
+    history = min(histories, key=lambda history: history.oldest or 0)
+    newest = history.newest or 0
     low = newest - from_seconds(seconds)
-    samples = history.samples_between(low, newest)
-    start = max(len(samples) - MOST_OF_FRAME, 0)
-    stamps, rows = samples.stamps[start:].tolist(), samples.rows[start:].tolist()
-    parents, authorities = samples.parents, samples.authorities
-    recent = []
-    for place, (stamp, row) in enumerate(zip(stamps, rows, strict=True), start):
-        if stamp >= low:
-            sample = TransformStamped.__new__(TransformStamped)
-            parent = history.parent if parents is None else parents[place]
-            authority = history.authority if authorities is None else authorities[place]
-            sample._fields = parent, frame, stamp, tuple(row), authority, False
-            recent.append(sample)
-    return recent
-
-
-def _oldest(history: FrameHistory) -> int:
-    return 0 if history.oldest is None else history.oldest
+    stamps = history.samples_between(low, newest).stamps[-MOST_OF_FRAME:]
+    low = max(low, int(stamps[0]))
+    return [sample for sample in samples_of(history, low, newest) if sample.stamp >= low]
 
 
 @dataclass(slots=True)
@@ -137,7 +120,7 @@ class HistoryAsker:
         waiting = self.open.get(peer)
         if waiting is None or len(waiting.held) >= MOST_HELD:
             return False
-        size = sum(1 + len(entry.samples) if isinstance(entry, ReceivedBatch) else 1 for entry in message.entries)
+        size = sum(1 + entry.size for entry in message.entries)
         if self._size + size > MOST_HELD_SAMPLES:
             return False
         waiting.held.append(message)
@@ -150,7 +133,8 @@ class HistoryAsker:
         waiting = self.open.get(peer)
         if waiting is None or message.claim.final:
             return False
-        last = max(_children(message), default="")
+        batches = (entry for entry in message.entries if isinstance(entry, ReceivedBatch))
+        last = max((sample.child for batch in batches for sample in batch.samples), default="")
         if last <= waiting.after or len(waiting.held) >= MOST_HELD:
             return False
         self._ask(peer, last)
@@ -177,10 +161,3 @@ class HistoryAsker:
     def next_due(self) -> float:
         """The time at which `overdue` is to be called next."""
         return min((waiting.due for waiting in self.open.values()), default=inf)
-
-
-def _children(message: Heard) -> Iterable[str]:
-    for entry in message.entries:
-        if isinstance(entry, ReceivedBatch):
-            for sample in entry.samples:
-                yield sample._fields[1]

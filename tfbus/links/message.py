@@ -43,8 +43,7 @@ from tfbus.errors import (
     TransformLookupError,
 )
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import Entry, OutgoingBatch, ReceivedBatch, ReceivedTransform, RemovedFrame
-from tfbus.links.replica import Claim
+from tfbus.links.replica import Claim, Entry, OutgoingBatch, ReceivedBatch, ReceivedTransform, RemovedFrame
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
 from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode, decode_in_parts, encode, refusal
@@ -56,8 +55,6 @@ MAX_HEAD = 2**20
 """The largest part of a message before its samples."""
 MAX_TEXT = 2**17
 """The largest message of JSON."""
-MAX_LOOKUP = 2**16
-"""The largest message that is read."""
 MAX_DEPTH = 16
 """The deepest nesting of values; an error with its cause takes two levels."""
 MAX_ENTRIES = 10_000
@@ -182,7 +179,7 @@ def write_message(out: Outgoing, entries: Sequence[Entry] = ()) -> bytes:
     """
     samples: list[TransformStamped] = []
     for entry in entries:
-        if type(entry) is OutgoingBatch:
+        if isinstance(entry, OutgoingBatch):
             samples += entry.samples
     if len(samples) > MAX_SAMPLES:
         raise ValueError(f"a message of {len(samples)} samples, more than {MAX_SAMPLES}")
@@ -375,8 +372,7 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
         valid = [sample for sample in samples[place : place + len(entry.tags)] if sample is not None]
         place += len(entry.tags)
         size += 1 + len(entry.tags)
-        authorities = {authority for authority, _ in entry.tags}
-        heard.entries.append(ReceivedBatch(valid, authorities, entry.origin, entry.sequence))
+        heard.entries.append(ReceivedBatch(entry.origin, entry.sequence, valid))
     yield heard
 
 
@@ -389,7 +385,7 @@ def read_fields(data: bytes) -> dict[str, Any]:
         If there is none.
     """
     try:
-        return _read(data, MAX_TEXT)
+        return _read(data)
     except ValueError as error:
         raise MalformedMessageError("text", str(error)) from None
 
@@ -488,7 +484,7 @@ def read_question(data: bytes) -> RemoteQuestion:
     ValueError
         If they are no question, or it has an integer of more than 64 bits or a name of more than `MAX_NAME` bytes.
     """
-    fields = _read(data, MAX_LOOKUP)
+    fields = _read(data)
     for name, value in fields.items():
         if isinstance(value, str) and len(value.encode()) > MAX_NAME:
             raise ValueError(f"its field {_shown(name)} has more than {MAX_NAME} bytes")
@@ -514,7 +510,7 @@ def read_answer(
     With a question, an answer about other frames or another stamp is none.
     """
     try:
-        answer = _answer_of(_read(data, MAX_LOOKUP))
+        answer = _answer_of(_read(data))
         if question is not None and isinstance(answer, TransformStamped):
             _check_answers(answer, question)
     except Exception as error:  # noqa: BLE001 - the asker gets one kind of error for all bad answers
@@ -548,10 +544,10 @@ def as_timeout(timeout: float | None, longest: float) -> float:
     return longest if timeout is None or math.isnan(timeout) else min(timeout, longest)
 
 
-def _read(data: bytes, longest: int) -> dict[str, Any]:
+def _read(data: bytes) -> dict[str, Any]:
     """The JSON object in some bytes; raises `ValueError` if they are none, or beyond a bound."""
-    if len(data) > longest:
-        raise ValueError(f"{len(data)} bytes, more than {longest}")
+    if len(data) > MAX_TEXT:
+        raise ValueError(f"{len(data)} bytes, more than {MAX_TEXT}")
     try:
         fields = json.loads(data, parse_int=_integer)
     except RecursionError:

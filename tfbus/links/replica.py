@@ -1,12 +1,16 @@
-"""The domain is one replicated map, and each link holds a copy of it.
+"""The domain is one replicated map, and each bus holds a copy of it, which its links share.
 
 The map
 -------
 Frame -> the *entry* of the highest rank: a sample, static or the newest moving one, or a removal. A rank is the number
-and the origin of the batch or removal (see `tfbus.links.relay`). So of two entries all links keep the same one, in any
+and the origin of the batch or removal (see `tfbus.links.relay`). So of two entries all buses keep the same one, in any
 order of arrival: a last-writer-wins map (Shapiro, Preguica, Baquero and Zawirski, "Conflict-free replicated data
-types", 2011). Every link that holds an entry can pass it on, not only its author. The copy also holds entries that its
-bus refuses.
+types", 2011). Every bus that holds an entry can pass it on, not only its author. The copy also holds entries that its
+bus refuses, or hides because their bus is lost.
+
+A link sees the map by *views*. One is of the frames that the links of its own robot bring, with all that comes from
+its bus; it is told to others. One more is of the frames that the links of each other robot bring. Every view has a
+digest of its entries. A frame stays in a view whatever link brings it later.
 
 The *newest* moving sample is the one that was published last. A buffer orders samples by their stamps instead, which
 is the same unless a program publishes an older stamp later. Then the map holds the older stamp: so a recording that is
@@ -28,9 +32,9 @@ question  one link   a request for the changes of a copy since a sequence (and t
 answer    one link   entries, the sequence up to which they are complete, and whether that is the newest
 ========  =========  ==========================================================================================
 
-Each copy numbers its own changes: its *sequence* (as Syncthing does). An entry is *settled* once it has not changed for
-`SETTLING`; a static sample, a removal, and what an answer has told are settled at once. The digest is over settled
-entries, so a frame that moves many times a second does not make copies differ.
+Each bus numbers the changes of its copy: its *sequence* (as Syncthing does). An entry is *settled* once it has not
+changed for `SETTLING`; a static sample, a removal, and what an answer has told are settled at once. The digest is over
+settled entries, so a frame that moves many times a second does not make copies differ.
 
 1. A sign with the digest of one's own copy needs nothing: what that copy holds up to its sequence is here.
    A copy of some frames only is compared over these, once its link has asked for them.
@@ -59,14 +63,15 @@ BGP, RFC 4271).
 """
 
 import heapq
+import os
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from math import inf
 from random import uniform
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 try:
     # hashlib has it too, but loads OpenSSL for others, which takes 0.6 MB of each process with a link.
@@ -75,7 +80,7 @@ except ImportError:  # A Python that has it elsewhere.
     from hashlib import blake2b
 
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import Entry, OutgoingBatch, Rank, RemovedFrame
+from tfbus.rows import Row
 
 SETTLING = 1.5
 """s; a frame that moves less often than that is in the digests between its samples."""
@@ -98,31 +103,148 @@ _ASK_AGAIN = 30.0
 _SPARE = 1_000
 _NEVER = -inf
 
+Rank = tuple[int, bytes]
+"""Number and origin. Of two things that are said of one frame, the one of the higher rank holds."""
+LOWEST: Rank = (-1, b"")
+
+
+# Statements
+
+
+@dataclass(eq=False, slots=True)
+class OutgoingBatch:
+    """Samples of one batch and one origin, as they go out.
+
+    Attributes
+    ----------
+    origin : bytes
+        The bus on which the batch was published first, 16 bytes.
+    sequence : int
+        The batch's number on that bus.
+    samples : sequence of TransformStamped
+    """
+
+    origin: bytes
+    sequence: int
+    samples: Sequence[TransformStamped]
+
+    @property
+    def size(self) -> int:
+        """The number of its samples."""
+        return len(self.samples)
+
+    def within(self, frames: Collection[str] | None) -> "OutgoingBatch | None":
+        """The part of it that is about some frames; None if it has none."""
+        if frames is None:
+            return self
+        samples = tuple(sample for sample in self.samples if sample._fields[1] in frames)
+        return OutgoingBatch(self.origin, self.sequence, samples) if samples else None
+
+
+@dataclass(frozen=True, slots=True)
+class RemovedFrame:
+    """A frame was removed, by the batch number `sequence` of the bus `origin`."""
+
+    origin: bytes
+    sequence: int
+    frame: str
+    size: ClassVar[int] = 1
+
+    def within(self, frames: Collection[str] | None) -> "RemovedFrame | None":
+        """The removal itself if it is of one of some frames; None if not."""
+        return self if frames is None or self.frame in frames else None
+
+
+Entry = OutgoingBatch | RemovedFrame
+
+
+@dataclass(eq=False, slots=True)
+class Provenance:
+    """The source of a batch or removal.
+
+    Attributes
+    ----------
+    origin : bytes
+        The bus on which it was published first, 16 bytes.
+    sequence : int
+        Its number on that bus; later ones have higher numbers.
+    outbox : Outbox or None
+        The link that brought it, which does not send it back. None for this bus's own.
+    peer : Peer or None
+        The other end of that link; None for this bus's own.
+    """
+
+    origin: bytes
+    sequence: int
+    outbox: object | None = None
+    peer: object | None = None
+
+    @property
+    def rank(self) -> Rank:
+        """Of two things that were said of a frame, the one of the higher rank holds."""
+        return self.sequence, self.origin
+
+
+class ReceivedTransform(TransformStamped):
+    """A sample that came over a link; equal to one that did not."""
+
+    __slots__ = ("_provenance",)
+    _provenance: Provenance
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A copy in another process has not come over this link.
+        return TransformStamped, (self.parent, self.child, self.stamp, self.transform, self.authority, self.static)
+
+
+class ReceivedBatch(OutgoingBatch):
+    """A batch as it came in; the provenance of its samples is not set yet."""
+
+    __slots__ = ()
+    samples: list[ReceivedTransform]
+
+
+# The map
+
 
 @dataclass(eq=False, slots=True)
 class Known:
-    """The newest statement on one frame: a sample or a removal.
+    """The newest statement on one frame, a sample or a removal, and what the bus has heard of the frame.
 
     Attributes
     ----------
     frame : str
-    number, origin
-        The rank.
+    source : Provenance
+        Its rank is that of the entry.
     sample : TransformStamped or None
         None if the frame was removed.
-    ours : bool
-        Whether this link brings it to the domain: it came from the bus, and not by this link.
+    views : tuple of View
+        The views that have it; they only grow, so that all buses agree on them.
+    route : tuple of View
+        The views to which the last statement was added.
+    shown : Provenance or None
+        The source of the newest sample on the bus; None while the bus does not show the frame.
+    floor : Rank
+        The rank of the newest static sample or removal: no sample before it is news.
+    numbers : dict of bytes to int
+        The newest number that each origin has given a sample which was published here, and under b"" the highest of the
+        forgotten origins.
+    passed : dict or None
+        The newest samples that went over the bus, beside a world without origins.
     sequence : int
         The number of the change; 0 while it has none.
     digest : int
-        Its part of the digest; 0 until it has settled.
+        Its part of the digests; 0 until it has settled.
     """
 
     frame: str
-    number: int
-    origin: bytes
+    source: Provenance
     sample: TransformStamped | None
-    ours: bool
+    views: "tuple[View, ...]" = ()
+    route: "tuple[View, ...]" = ()
+    shown: Provenance | None = None
+    floor: Rank = LOWEST
+    numbers: dict[bytes, int] = field(default_factory=dict)
+    passed: dict[tuple[str, int, Row | None], None] | None = None
     sequence: int = 0
     digest: int = 0
 
@@ -130,8 +252,8 @@ class Known:
     def told(self) -> Entry:
         """As it goes into a message."""
         if self.sample is None:
-            return RemovedFrame(self.origin, self.number, self.frame)
-        return OutgoingBatch(self.origin, self.number, (self.sample,))
+            return RemovedFrame(self.source.origin, self.source.sequence, self.frame)
+        return OutgoingBatch(self.source.origin, self.source.sequence, (self.sample,))
 
 
 class Claim(NamedTuple):
@@ -160,47 +282,25 @@ class TooManyEntriesError(ValueError):
     """A bus, or all together, has more frames than a copy holds."""
 
 
-@dataclass(eq=False, slots=True)
-class Places:
-    """The room that all copies of one link have together.
-
-    Attributes
-    ----------
-    max_frames : int
-        How many frames one origin may have.
-    held : Counter
-        How many frames each origin has, except the own one.
-    taken, removals : int
-        How many frames and removals there are.
-    """
-
-    max_frames: int
-    held: Counter[bytes] = field(default_factory=Counter)
-    taken: int = 0
-    removals: int = 0
-
-
 class Replica:
-    """One copy of the map.
-
-    Parameters
-    ----------
-    max_frames : int
-        How many frames one origin may have, but for the own one.
-    own : bytes
-        The own origin.
-    places : Places, optional
-        Shared by the copies of one link.
+    """The copy of the map that a bus holds, for all its links.
 
     Attributes
     ----------
+    origin : bytes
+        The name of the bus for others: 16 random bytes. Its own frames are not counted.
     entries : dict of str to Known
+    sequence : int
+        The number of the newest change.
     """
 
-    def __init__(self, max_frames: int, own: bytes, places: Places | None = None) -> None:
-        self._places = Places(max_frames) if places is None else places
-        self._own = own
+    def __init__(self) -> None:
+        self.origin = os.urandom(16)
         self.entries: dict[str, Known] = {}
+        self.sequence = 0
+        # How many frames each other origin has.
+        self._held: Counter[bytes] = Counter()
+        self._taken = 0
         # A heap of the removals, the lowest ranks first; a removal stays in it for a while after a newer entry.
         self._removals: list[tuple[Rank, str]] = []
         self._removed = 0
@@ -209,21 +309,29 @@ class Replica:
         self._unsettled: dict[str, float] = {}
         # The changes in their order; a frame that has changed again since has a higher sequence.
         self._log: list[tuple[int, Known]] = []
-        self._digest = 0
-        self._sequence = 0
 
     def note(
-        self, frame: str, rank: Rank, sample: TransformStamped | None, *, ours: bool = False, settles: bool = False
+        self,
+        frame: str,
+        source: Provenance,
+        sample: TransformStamped | None,
+        route: "tuple[View, ...]" = (),
+        *,
+        max_frames: float = inf,
+        settles: bool = False,
     ) -> bool:
         """Take in an entry, if it is of a higher rank than the known one; returns whether it was.
 
         Parameters
         ----------
         frame : str
-        rank : (int, bytes)
+        source : Provenance
         sample : TransformStamped or None
             None for a removal.
-        ours : bool
+        route : tuple of View
+            The views to which this brings the frame.
+        max_frames : float
+            How many frames one origin may have, but for the own one.
         settles : bool
             Whether the entry may change again in a moment: it is a live sample of a moving frame.
 
@@ -232,131 +340,79 @@ class Replica:
         TooManyEntriesError
             If its bus, or all together, has too many frames.
         """
-        number, origin = rank
         known = self.entries.get(frame)
-        if known is not None and number <= known.number and not self._replaces(rank, sample, known):
+        is_new = known is None or source.sequence > known.source.sequence or self._replaces(source, sample, known)
+        if is_new:
+            if known is None or known.source.origin != source.origin or (known.sample is None) is not (sample is None):
+                self._admit(source.origin, known, sample, max_frames)
+            if known is None:
+                known = self.entries[frame] = Known(frame, source, sample)
+            else:
+                known.source, known.sample = source, sample
+        assert known is not None
+        if route is not known.route and (is_new or source.rank == known.source.rank):
+            known.route = route
+            self.widen(known, route)
+        if not is_new:
             return False
-        was_removed = known is not None and known.sample is None
-        if known is None or known.origin != origin or was_removed is not (sample is None):
-            self._count(origin, known, sample)
-            self._forgive(was_removed - (sample is None))
-        if known is None:
-            known = self.entries[frame] = Known(frame, number, origin, sample, ours)
-        else:
-            known.number, known.origin, known.sample, known.ours = number, origin, sample, ours
         if settles:
             self._fresh[frame] = None
-        else:
-            # Numbered at once, because a hundred thousand entries at the next claim would take a turn of seconds.
-            self._fresh.pop(frame, None)
-            self._unsettled.pop(frame, None)
-            self._number(known, settled=True)
+            return True
+        # Numbered at once, because a hundred thousand entries at the next claim would take a turn of seconds.
+        self._fresh.pop(frame, None)
+        self._unsettled.pop(frame, None)
+        self._number(known, settled=True)
         if sample is None:
-            heapq.heappush(self._removals, (rank, frame))
-            if self._too_many_removals or len(self._removals) > 2 * MOST_REMOVALS:
+            known.floor = source.rank
+            heapq.heappush(self._removals, (source.rank, frame))
+            if self._removed > MOST_REMOVALS or len(self._removals) > 2 * MOST_REMOVALS:
                 self._forget_removals()
+        elif sample.static:
+            known.floor = source.rank
         return True
 
-    def claim(self, now: float, frames: Collection[str] | None = None) -> Claim:
-        """The sequence and the digest of the copy, or of the part of it that is about some frames."""
-        self._settle(now)
-        digest = self._digest
-        if frames is not None:
-            digest = 0
-            for known in filter(None, map(self.entries.get, frames)):
-                digest ^= known.digest
-        return Claim(self._sequence, self._sequence, digest)
+    def widen(self, known: Known, views: "Iterable[View]") -> None:
+        """Let an entry be in some views too."""
+        new = [view for view in views if view not in known.views and view.holds(known.frame)]
+        if new:
+            known.views += (*new,)
+            for view in new:
+                view.digest ^= known.digest
+            if known.sequence:
+                self._number(known)
 
-    def changes(
-        self, since: int, now: float, frames: Collection[str] | None = None, limit: int = CHUNK
-    ) -> tuple[list[Entry], Claim]:
-        """The oldest changes behind a sequence, and the claim that goes with them.
+    def narrow(self, views: "Collection[View]", keep_removals: bool) -> None:
+        """Forget some views, and the entries that neither a view has nor the bus shows."""
+        for known in list(self.entries.values()):
+            known.views, known.route = tuple(view for view in known.views if view not in views), ()
+            if not (known.views or known.shown or (keep_removals and known.sample is None)):
+                self.discard(known)
 
-        A sequence that the copy has not reached gives the beginning of all that it holds: a claim since 0. Entries that
-        have not settled are among the changes.
-        """
-        self._settle(now)
+    def discard(self, known: Known) -> None:
+        """Forget an entry."""
+        self._release(known)
+        self._weigh(known, 0)
+        del self.entries[known.frame]
+        known.sequence = 0
+        self._fresh.pop(known.frame, None)
+        self._unsettled.pop(known.frame, None)
+
+    def changes(self, since: int, now: float) -> Iterator[Known]:
+        """The entries that have changed behind a sequence, the oldest changes first, settled or not."""
+        self.settle(now)
         for frame in self._unsettled:
             # Numbered now for the order of this answer, and again when it settles, for the links without this answer.
             if not self.entries[frame].sequence:
                 self._number(self.entries[frame])
-        if since > self._sequence:
-            since = 0
-        log: Iterable[tuple[int, Known]]
-        if frames is None:
-            log = islice(self._log, bisect_right(self._log, since, key=_first), None)
-        else:
-            log = sorted(((known.sequence, known) for known in map(self.entries.get, frames) if known), key=_first)
-        found: list[Entry] = []
-        for sequence, known in log:
-            if sequence > since and known.sequence == sequence:
-                found.append(known.told)
-                if len(found) == limit and sequence < self._sequence:
-                    return found, Claim(since, sequence, 0, final=False)
-        return found, self.claim(now, frames)._replace(since=since)
+        log = islice(self._log, bisect_right(self._log, since, key=_first), None)
+        return (known for sequence, known in log if known.sequence == sequence)
 
-    def ours(self, limit: int) -> list[Entry] | None:
-        """All that this link brings to the domain; None if that is more than a limit."""
-        ours = (known.told for known in self.entries.values() if known.ours and known.sample is not None)
-        found = list(islice(ours, limit + 1))
-        return None if len(found) > limit else found
-
-    def told(self) -> Iterator[Entry]:
-        """All entries."""
-        return (known.told for known in self.entries.values())
-
-    def moving(self) -> list[str]:
-        """The moving frames that this link brings to the domain, sorted."""
-        found = (known for known in self.entries.values() if known.ours and known.sample is not None)
-        return sorted(known.frame for known in found if known.sample is not None and not known.sample.static)
-
-    def _replaces(self, rank: Rank, sample: TransformStamped | None, known: Known) -> bool:
-        if rank != (known.number, known.origin):
-            return rank > (known.number, known.origin)
-        # Two samples of one batch.
-        return sample is not None and known.sample is not None and sample.stamp > known.sample.stamp
-
-    def _count(self, origin: bytes, known: Known | None, sample: TransformStamped | None) -> None:
-        if sample is not None and origin != self._own:
-            held, most = self._places.held, self._places.max_frames
-            if held.get(origin, 0) >= most or self._places.taken >= MANY_ORIGINS * most:
-                raise TooManyEntriesError(f"the peer has announced more than {most} frames")
-            held[origin] += 1
-            self._places.taken += 1
-        if known is not None and known.sample is not None:
-            self._release(known.origin)
-
-    def _release(self, origin: bytes) -> None:
-        if origin != self._own:
-            held = self._places.held
-            held[origin] -= 1
-            self._places.taken -= 1
-            if not held[origin]:
-                del held[origin]
-
-    def forget(self) -> None:
-        """Give all places to the other copies."""
-        for entry in self.entries.values():
-            if entry.sample is not None:
-                self._release(entry.origin)
-        self._forgive(self._removed)
-        self.entries.clear()
-
-    def _forgive(self, removals: int) -> None:
-        """Count so many removals less."""
-        self._removed -= removals
-        self._places.removals -= removals
-
-    @property
-    def _too_many_removals(self) -> bool:
-        return self._removed > MOST_REMOVALS or self._places.removals > MANY_ORIGINS * MOST_REMOVALS
-
-    def _settle(self, now: float) -> None:
-        """Number the settled changes, and take the unsettled ones out of the digest."""
+    def settle(self, now: float) -> None:
+        """Number the settled changes, and take the unsettled ones out of the digests."""
         for frame in self._fresh:
             known = self.entries[frame]
-            self._digest ^= known.digest
-            known.digest = known.sequence = 0
+            self._weigh(known, 0)
+            known.sequence = 0
             self._unsettled.pop(frame, None)
             self._unsettled[frame] = now
         self._fresh.clear()
@@ -367,36 +423,126 @@ class Replica:
             del self._unsettled[frame]
             self._number(self.entries[frame], settled=True)
 
+    @staticmethod
+    def _replaces(source: Provenance, sample: TransformStamped | None, known: Known) -> bool:
+        if source.sequence != known.source.sequence or source.origin != known.source.origin:
+            return source.rank > known.source.rank
+        # Two samples of one batch.
+        return sample is not None and known.sample is not None and sample.stamp > known.sample.stamp
+
+    def _admit(self, origin: bytes, known: Known | None, sample: TransformStamped | None, max_frames: float) -> None:
+        """Count a new entry in place of a known one."""
+        if sample is not None and origin != self.origin:
+            if self._held[origin] >= max_frames or self._taken >= MANY_ORIGINS * max_frames:
+                raise TooManyEntriesError(f"the peer has announced more than {max_frames} frames")
+            self._held[origin] += 1
+            self._taken += 1
+        self._removed += sample is None
+        if known is not None:
+            self._release(known)
+
+    def _release(self, known: Known) -> None:
+        """Count an entry no more."""
+        origin = known.source.origin
+        self._removed -= known.sample is None
+        if known.sample is not None and origin != self.origin:
+            self._held[origin] -= 1
+            self._taken -= 1
+            if not self._held[origin]:
+                del self._held[origin]
+
     def _number(self, known: Known, settled: bool = False) -> None:
-        self._sequence += 1
-        known.sequence = self._sequence
-        self._log.append((self._sequence, known))
+        self.sequence += 1
+        known.sequence = self.sequence
+        self._log.append((self.sequence, known))
         if len(self._log) > 2 * len(self.entries) + _SPARE:
             self._log = [(number, known) for number, known in self._log if known.sequence == number]
         if settled:
-            rank = b"%b%d %d " % (known.origin, known.number, known.sample is None)
-            digest = int.from_bytes(hash_bytes(rank + known.frame.encode("utf-8", "surrogatepass"), 8), "little")
-            self._digest ^= digest ^ known.digest
-            known.digest = digest
+            rank = b"%b%d %d " % (known.source.origin, known.source.sequence, known.sample is None)
+            digest = hash_bytes(rank + known.frame.encode("utf-8", "surrogatepass"), 8)
+            self._weigh(known, int.from_bytes(digest, "little"))
+
+    def _weigh(self, known: Known, digest: int) -> None:
+        change, known.digest = known.digest ^ digest, digest
+        for view in known.views:
+            view.digest ^= change
 
     def _forget_removals(self) -> None:
         """Forget the removals of the lowest ranks beyond the bound, so that all copies forget the same ones."""
-        while self._removed and self._too_many_removals:
+        while self._removed > MOST_REMOVALS:
             rank, frame = heapq.heappop(self._removals)
             if self._is_removed(frame, rank):
-                self._forgive(1)
-                known = self.entries.pop(frame)
-                self._digest ^= known.digest
-                known.sequence = 0
-                self._fresh.pop(frame, None)
-                self._unsettled.pop(frame, None)
+                self.discard(self.entries[frame])
         if len(self._removals) > 2 * MOST_REMOVALS:
             self._removals = [(rank, frame) for rank, frame in self._removals if self._is_removed(frame, rank)]
             heapq.heapify(self._removals)
 
     def _is_removed(self, frame: str, rank: Rank) -> bool:
-        entry = self.entries.get(frame)
-        return entry is not None and entry.sample is None and (entry.number, entry.origin) == rank
+        known = self.entries.get(frame)
+        return known is not None and known.sample is None and known.source.rank == rank
+
+
+class View:
+    """The part of the map that a link tells to others, or that the links of a robot bring by it.
+
+    Parameters
+    ----------
+    replica : Replica
+    frames : frozenset of str or None
+        Other frames are not in it; None for all.
+
+    Attributes
+    ----------
+    digest : int
+        The digest of its settled entries.
+    route : tuple of View
+        The views to which all that comes by this one is added: this one, and those that the other links tell.
+    """
+
+    def __init__(self, replica: Replica, frames: frozenset[str] | None = None) -> None:
+        self._replica = replica
+        self._frames = frames
+        self.digest = 0
+        self.route: tuple[View, ...] = (self,)
+
+    def holds(self, frame: str) -> bool:
+        """Whether a frame may be in it."""
+        return self._frames is None or frame in self._frames
+
+    def claim(self, now: float, frames: Collection[str] | None = None) -> Claim:
+        """The sequence and the digest of the view, or of the part of it that is about some frames."""
+        self._replica.settle(now)
+        digest = self.digest
+        if frames is not None:
+            digest = 0
+            for known in filter(None, map(self._replica.entries.get, frames)):
+                if self in known.views:
+                    digest ^= known.digest
+        return Claim(self._replica.sequence, self._replica.sequence, digest)
+
+    def changes(
+        self, since: int, now: float, frames: Collection[str] | None = None, limit: int = CHUNK
+    ) -> tuple[list[Entry], Claim]:
+        """The oldest changes behind a sequence, and the claim that goes with them.
+
+        A sequence that the copy has not reached gives the beginning of all that it holds: a claim since 0. Entries that
+        have not settled are among the changes.
+        """
+        if since > self._replica.sequence:
+            since = 0
+        found: list[Entry] = []
+        for known in self._replica.changes(since, now):
+            if self in known.views and (frames is None or known.frame in frames):
+                found.append(known.told)
+                if len(found) == limit and known.sequence < self._replica.sequence:
+                    return found, Claim(since, known.sequence, 0, final=False)
+        return found, self.claim(now, frames)._replace(since=since)
+
+    def brought(self, outbox: object) -> Iterator[Known]:
+        """The frames of it that a link itself brings to the domain: they came from the bus, and not by this link."""
+        for known in self._replica.entries.values():
+            if known.sample is not None and known.source.outbox is not outbox and self in known.views:
+                yield known
 
 
 def hash_bytes(data: bytes, size: int) -> bytes:
@@ -408,14 +554,17 @@ def _first(logged: tuple[int, Known]) -> int:
     return logged[0]
 
 
+# The questions
+
+
 @dataclass(eq=False, slots=True)
 class _Copy:
     """The copy of one peer, as far as it is known.
 
     Attributes
     ----------
-    replica : Replica
-        The own copy that is to agree with it.
+    view : View
+        The own view that is to agree with it.
     seen : int
         All changes up to this sequence are here.
     must_ask : bool
@@ -434,7 +583,7 @@ class _Copy:
         Answers without news, and questions without an answer, one after the other.
     """
 
-    replica: Replica
+    view: View
     seen: int
     must_ask: bool
     frames: Collection[str] | None = None
@@ -462,17 +611,17 @@ class Agreement:
 
     def __init__(self) -> None:
         self._copies: dict[str, _Copy] = {}
-        self._remembered: dict[str, tuple[Replica, int]] = {}
+        self._remembered: dict[str, tuple[View, int]] = {}
         self._asked: Question | None = None
         self._patience = _NEVER
         # The time at which one of the questions that were put off is asked.
         self._latest = inf
         self._is_new = True
 
-    def joined(self, peer: str, replica: Replica, now: float, must_ask: bool = False) -> None:
+    def joined(self, peer: str, view: View, now: float, must_ask: bool = False) -> None:
         """Begin to follow the copy of a peer; it has to be asked if this is the first one, or if the caller says so."""
-        remembered, seen = self._remembered.pop(peer, (replica, 0))
-        self._copies[peer] = copy = _Copy(replica, seen if remembered is replica else 0, must_ask)
+        remembered, seen = self._remembered.pop(peer, (view, 0))
+        self._copies[peer] = copy = _Copy(view, seen if remembered is view else 0, must_ask)
         if self._is_new or must_ask:
             self._is_new = False
             copy.due, copy.missed, copy.urgent = now, True, True
@@ -487,7 +636,7 @@ class Agreement:
         """Follow the copy of a peer no more."""
         copy = self._copies.pop(peer, None)
         if copy is not None and copy.seen:
-            self._remembered[peer] = copy.replica, copy.seen
+            self._remembered[peer] = copy.view, copy.seen
             if len(self._remembered) > MOST_REMEMBERED:
                 del self._remembered[next(iter(self._remembered))]
         if self._asked is not None and self._asked.peer == peer:
@@ -596,7 +745,7 @@ class Agreement:
         return min(map(self._due_of, self._copies), default=inf)
 
     def _agrees(self, copy: _Copy, now: float) -> bool:
-        return copy.claim is not None and copy.claim.digest == copy.replica.claim(now, copy.frames).digest
+        return copy.claim is not None and copy.claim.digest == copy.view.claim(now, copy.frames).digest
 
     def _fail(self, copy: _Copy, now: float) -> None:
         copy.silences = min(copy.silences + 1, 10)

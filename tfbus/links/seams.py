@@ -1,28 +1,23 @@
-"""The seams below a link: a wire to buses of tfbus, or a carrier to another world. An author of either reads this page.
+"""The seam below a link of tfbus: a wire. Its author reads this page.
 
 A link of tfbus decides what it sends to which link, and which samples are news (`tfbus.links.domain`). Its `Wire`
 knows one network: it moves bytes between the links of one domain, and tells which links are present. A new network is
-one class.
-
-Another world, such as ROS, has messages of its own. A link to it (`tfbus.links.endpoint.ForeignEnd`) decides what goes
-out and what is news as well; its `Carrier` writes and reads the messages of that world.
+one class. `tfbus.links.ros.foreign_end` has the seam below a link to another world, such as ROS.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Final, NamedTuple, Protocol
 
-from tfbus.errors import InvalidTransformError
-from tfbus.links.relay import ReceivedBatch, Turn
 from tfbus.tf_message import MalformedMessageError
 
 MAX_MESSAGE: Final = 2**22 + 2**16
 """Bytes; no message is larger, and a wire refuses a larger one before it holds all of it in memory."""
 
 
-# Between buses of tfbus
+# The wire
 
 
 class Hearing(NamedTuple):
@@ -141,7 +136,7 @@ class Wire(Protocol):
         """
 
 
-# To other worlds
+# Both kinds of links
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,28 +166,6 @@ class Received:
     moving: bool = False
     urgent: bool = False
     follows: bool = False
-
-
-@dataclass(slots=True)
-class ReceivedMessage:
-    """One message of another world, decoded.
-
-    Attributes
-    ----------
-    batches : list of ReceivedBatch
-        In the order in which they were published; they have no origin.
-    errors : list of InvalidTransformError
-        One for each sample that was refused; `batches` have the others.
-    time : int or None
-        The time of the sender's clock, in ns, if it tells that.
-    continues : bool
-        Whether it is a later part of a message that was counted.
-    """
-
-    batches: list[ReceivedBatch]
-    errors: list[InvalidTransformError] = field(default_factory=list)
-    time: int | None = None
-    continues: bool = False
 
 
 class SendReport:
@@ -230,85 +203,3 @@ class SendReport:
     def failed(self, error: Exception) -> None:
         """Tell of a message that the network did not accept."""
         self._warn(error)
-
-
-class Carrier(Protocol):
-    """Sends the messages of a link over one network, and receives those of its peers.
-
-    The link decides which samples go out, are news, or are refused. A carrier writes them, and keeps static frames for
-    late joiners as its network allows. A carrier is used by one link, and opened once.
-
-    The event loop calls everything here, in this order: `open`; then, while `run` runs as a task, `send` and `read`;
-    when `run` has been cancelled, a last `send` may have come, and `close` is called.
-
-    Attributes
-    ----------
-    id : str
-        The name of this end for its peers.
-    """
-
-    id: str
-
-    async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
-        """Connect to the network.
-
-        Parameters
-        ----------
-        receive : callable
-            Takes an item that has come: a peer's message, that a peer has come or gone, or that a message was refused.
-            Any thread may call it, from now until `close` has returned and later; it never blocks and never raises.
-            Items are handled in the order of the calls, so a peer's `Left` has to be the last of its items. A
-            carrier whose network tells nothing of presence leaves presence out.
-        report : SendReport
-            Counts sent and unsent messages; for the event loop only.
-
-        Raises
-        ------
-        OSError
-            If there is no connection. After any error, also when cancelled, the link calls `close` next.
-        """
-
-    def send(self, turn: Turn) -> None:
-        """Send what one turn of the event loop has published and removed; a turn is never empty.
-
-        It must not block and must not raise: entries that the carrier's messages cannot hold, and messages that the
-        network does not accept, go to the report. Entries leave in order; the changes of static frames go out behind
-        the entries of the same turn and may be conflated with later ones.
-        """
-
-    def split(self, content: Any) -> Iterator[Any]:
-        """The content of an item in parts, for `read` one by one; an item that is small is its only part.
-
-        It may also yield None, where other tasks may have their turn before there is a part.
-
-        Raises
-        ------
-        MalformedMessageError
-            If the rest of the message cannot be used; the parts before it are.
-        """
-        return iter((content,))
-
-    def read(self, content: Any) -> ReceivedMessage:
-        """Decode a message: the content of an item that the carrier has passed to `receive`.
-
-        Its batches become this bus's own, and go out by the other links of the bus and never by this one. Samples that
-        cannot be decoded are in the message's errors.
-
-        Raises
-        ------
-        MalformedMessageError
-            If nothing of it can be used; it is counted by its reason.
-        """
-
-    async def run(self) -> None:
-        """Do the work that takes time, such as declaring static frames, until cancelled; may return early.
-
-        An error that it raises ends the link's body, as that of any task does.
-        """
-
-    async def close(self) -> None:
-        """Disconnect, also if `open` has failed or was cancelled; all that was sent before still goes out.
-
-        The closing has to begin before the first checkpoint, because asyncio's own cancellation knows no shield, and
-        has to return within about a second, whatever the network does.
-        """

@@ -16,7 +16,7 @@ from typing import Any
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
-from tfbus.links.relay import ReceivedTransform
+from tfbus.links.replica import ReceivedTransform
 from tfbus.stamps import SECOND
 from tfbus.tf_message import MAX_NAME, Decoded, MalformedMessageError
 

@@ -16,12 +16,12 @@ from typing import Any, Unpack
 from tfbus.bus.bus import Bus
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.endpoint import ForeignEnd
 from tfbus.links.link import Link
-from tfbus.links.relay import OutgoingBatch, ReceivedBatch, ReceivedTransform, Turn
+from tfbus.links.replica import OutgoingBatch, ReceivedTransform
+from tfbus.links.ros.foreign_end import Carrier, ForeignEnd, ReceivedMessage, Turn
 from tfbus.links.ros.messages import decode_clock, decode_text
 from tfbus.links.ros.settings import RosOptions, RosSettings
-from tfbus.links.seams import Carrier, Received, ReceivedMessage, SendReport
+from tfbus.links.seams import Received, SendReport
 from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, MalformedMessageError, decode, decode_in_parts, refusal
 
@@ -160,8 +160,7 @@ class RosCarrier(Carrier, ABC):
                 errors.append(error.with_traceback(None))
             else:
                 samples.append(sample)
-        batches = [ReceivedBatch(samples, {authority})] if samples else []
-        return ReceivedMessage(batches, errors=errors, continues=content.continues)
+        return ReceivedMessage(samples, errors=errors, continues=content.continues)
 
     async def run(self) -> None:
         """Do nothing that takes time."""

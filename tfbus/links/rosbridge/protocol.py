@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple, NoReturn
 import cbor2
 
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import ReceivedTransform
+from tfbus.links.replica import ReceivedTransform
 from tfbus.links.ros.messages import as_mapping, decode_mapping, decode_ros1, decode_ros1_in_parts, stamp_of
 from tfbus.links.ros.ros_link import AT_ONCE, MAX_SIZE, PART
 from tfbus.robot.joint_state_message import decode_joint_state

@@ -35,7 +35,7 @@ import anyio
 from tfbus._aio.task_groups import close_task_group
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.relay import ReceivedTransform
+from tfbus.links.replica import ReceivedTransform
 from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, settings_of
 from tfbus.links.rosbridge.protocol import (
