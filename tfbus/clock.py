@@ -225,8 +225,6 @@ class SimulatedClock:
             await clock.advance(10.0)
             tasks.cancel_scope.cancel()
 
-    Examples
-    --------
     >>> clock = SimulatedClock()
     >>> await clock.advance(1.5)
     >>> clock.now()

@@ -58,6 +58,8 @@ nitpick_ignore = [
 ]
 nitpick_ignore_regex = [
     ("py:class", r"(ArrayLike|NDArray|(collections\.abc|numpy)\.\w+)"),
+    # The names of type aliases, and of the keywords of a method.
+    ("py:class", r"(.*\.)?(AtLike|StampLike|StampsLike|StampsAs|Numbers|Changes)"),
     # The error of a message of a recording that cannot be read.
     ("py:class", r"tfbus\..*\.MalformedMessageError"),
     # The parts of a recording for code that reads it in blocks.
