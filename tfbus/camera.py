@@ -49,6 +49,11 @@ class Picture(NamedTuple):
         In m, along z of the optical frame.
     visible : array of bool, shape (n,)
         Whether the point is in front of the camera and inside of the picture. Things in front of it are not considered.
+
+    Examples
+    --------
+    >>> Picture(np.array([[370.0, 265.0]]), np.array([2.0]), np.array([True])).depth
+    array([2.])
     """
 
     pixels: Floats
@@ -159,6 +164,14 @@ class Camera:
             If the camera is not calibrated, or its model is unknown.
         TypeError
             If a field is missing.
+
+        Examples
+        --------
+        >>> info = {"header": {"frame_id": "optical"}, "width": 640, "height": 480, "distortion_model": "plumb_bob",
+        ...         "d": [], "k": [500.0, 0.0, 320.0, 0.0, 500.0, 240.0, 0.0, 0.0, 1.0],
+        ...         "r": np.eye(3), "p": np.zeros(12)}
+        >>> Camera.from_message(info).project([[0.0, 0.0, 1.0]])[0]
+        array([[320., 240.]])
         """
         names = {name: name if has(message, name) else name.upper() for name in "dkrp"}
         d, k, r, p = (np.array(get(message, names[name]), np.float64).ravel() for name in "dkrp")
@@ -196,6 +209,12 @@ class Camera:
             Column and row; NaN for points that are not in front of the camera. They may be outside of the picture.
         depth : array of shape (n,)
             In m, along z.
+
+        Examples
+        --------
+        >>> camera = Camera("optical", 640, 480, [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+        >>> camera.project([[0.2, 0.1, 2.0]])
+        (array([[370., 265.]]), array([2.]))
         """
         x, y, depth = self._directions(as_points(points))
         return self._pixels(x, y), depth
@@ -213,6 +232,12 @@ class Camera:
         array of shape (n, 3)
             Unit vectors in the optical frame; NaN where the lens shows nothing. With a ``shift`` they begin beside its
             origin.
+
+        Examples
+        --------
+        >>> camera = Camera("optical", 640, 480, [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+        >>> camera.ray([[695.0, 240.0]])
+        array([[0.6, 0. , 0.8]])
         """
         rays = self._straight(pixels)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -226,6 +251,12 @@ class Camera:
         pixels : array of shape (n, 2)
         depth : array of shape (n,)
             In m, along z, as the pictures of depth cameras have it.
+
+        Examples
+        --------
+        >>> camera = Camera("optical", 640, 480, [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+        >>> camera.deproject([[370.0, 265.0]], [4.0])
+        array([[0.4, 0.2, 4. ]])
         """
         points = self._straight(pixels) * np.asarray(depth, np.float64)[:, np.newaxis]
         return (points - self.shift) @ self.rotation
@@ -260,6 +291,16 @@ class Camera:
         ------
         TransformError
             As `Buffer.lookup`.
+
+        Examples
+        --------
+        >>> camera = Camera("optical", 640, 480, [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+        >>> with Bus() as bus, Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send_static("odom", "optical", Transform())
+        ...     cloud = PointCloud("odom", 5, np.array([[0.2, 0.1, 2.0]]))
+        ...     picture = await camera.project_cloud(buffer, cloud, at=5, fixed="odom")
+        >>> picture.pixels, picture.visible
+        (array([[370., 265.]]), array([ True]))
         """
         begin = as_stamp(at)
         end = begin + from_seconds(row_time * self.height)

@@ -71,6 +71,11 @@ def from_ecef(points: npt.ArrayLike) -> tuple[Any, Any, Any]:
     -----
     The closed form of Vermeille, "Direct transformation from geocentric coordinates to geodetic coordinates", Journal
     of Geodesy 76, 2002, pages 451 to 454.
+
+    Examples
+    --------
+    >>> [round(number, 6) for number in from_ecef((0.0, 6_378_137.0, 0.0))]
+    [0.0, 90.0, 0.0]
     """
     x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)
     flat = np.hypot(x, y)
@@ -139,15 +144,34 @@ class Datum:
     def sample(
         self, frame: str = "map", *, earth: str = "earth", stamp: int = 0, authority: str = ""
     ) -> TransformStamped:
-        """The static sample that hangs the map below the earth, for `Bus.publish`."""
+        """The static sample that hangs the map below the earth, for `Bus.publish`.
+
+        Examples
+        --------
+        >>> sample = Datum(0.0, 0.0).sample("map")
+        >>> sample.parent, sample.child, sample.static
+        ('earth', 'map', True)
+        """
         return TransformStamped(earth, frame, stamp, self.earth_from_map, authority, static=True)
 
     def to_map(self, latitude: npt.ArrayLike, longitude: npt.ArrayLike, height: npt.ArrayLike = 0.0) -> Floats:
-        """The coordinates of places in the map, shape (..., 3), in m; see `to_ecef`."""
+        """The coordinates of places in the map, shape (..., 3), in m; see `to_ecef`.
+
+        Examples
+        --------
+        >>> Datum(48.0, 11.0).to_map(48.0, 11.0, 2.0).round(6) + 0.0
+        array([0., 0., 2.])
+        """
         return self.earth_from_map.inverse().apply(to_ecef(latitude, longitude, height))
 
     def from_map(self, points: npt.ArrayLike) -> tuple[Any, Any, Any]:
-        """Latitude and longitude in degrees, and height in m, of points of the map, shape (..., 3)."""
+        """Latitude and longitude in degrees, and height in m, of points of the map, shape (..., 3).
+
+        Examples
+        --------
+        >>> [round(number, 6) for number in Datum(48.0, 11.0).from_map((0.0, 0.0, 2.0))]
+        [48.0, 11.0, 2.0]
+        """
         return from_ecef(self.earth_from_map.apply(np.asarray(points, np.float64)))
 
     def point(self, fix: NavSatFix, frame: str = "map") -> PointStamped:
@@ -157,6 +181,12 @@ class Datum:
         ------
         ValueError
             If the fix has a status below 0: the receiver had no position.
+
+        Examples
+        --------
+        >>> point = Datum(48.0, 11.0).point(NavSatFix("gps", 5, 48.0, 11.0, 2.0))
+        >>> point.frame, round(point.point[2], 6)
+        ('map', 2.0)
         """
         if fix.status < 0:
             raise ValueError("the receiver had no position: the status of the fix is -1")
