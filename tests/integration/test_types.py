@@ -72,7 +72,9 @@ def faults(folder: Path, mode: str) -> list[Any]:
 
 def test_pyright_finds_no_fault_with_the_demos(tmp_path: Path) -> None:
     for demo in (ROOT / "demos").glob("*.py"):
-        shutil.copy(demo, tmp_path)
+        # A demo with requirements of its own is checked where these are installed.
+        if "# /// script" not in demo.read_text(encoding="utf-8"):
+            shutil.copy(demo, tmp_path)
     assert faults(tmp_path, "basic") == []
 
 
