@@ -9,6 +9,7 @@ import inspect
 import re
 import tempfile
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -30,20 +31,15 @@ WITH_EXTRAS = {
 }
 """Modules whose examples need an extra, and a package of it."""
 
+OPTIONAL = {"scipy": "scipy", "to_dataframe": "pandas"}
+"""Words in examples that run only where a package is installed."""
+
 DOORS = [f"tfbus.{room}" for room in ("analysis", "axes", "camera", "earth", "links", "recording", "robot", "testing")]
 DOORS += ["tfbus", "tfbus.web"]
 
 WITHOUT_EXAMPLE = """
-    Arrival AuthorityConflict BufferServer.cancel BufferServer.lose BufferServer.statistics BufferServer.take
-    BufferServerStatistics Clock.move_on_after Clock.now Clock.on_jump Clock.sleep Clock.sleep_until Clock.ticks
-    Comparison Conversion.note DomainLink DomainLink.lookup DomainLink.serve Edits.apply Edits.keeps
-    EventStream.arrived EventStream.put FrameLive FrameStale KindChanged Link Link.is_behind Link.receive
-    Link.send_soon Link.stir LinkStatistics MessageFilter.set_target PastLoop PeerJoined PeerLost PeerRejected
-    Player.resume Player.step RecorderStatistics RecordingDropped RecordingFailed Reparented
-    RobotStatePublisher.publish_state RobotStatistics SampleRejected Spread StampAhead StampBehind
-    StaticTransform Statistics SubscriberFailed ThreadPublisher.discard ThreadPublisher.end
-    ThreadPublisher.forget Transform.as_scipy Transform.from_scipy TransformArray.as_scipy
-    TransformArray.from_scipy TransformArray.to_dataframe close_on_signal load_joint_states
+    BufferServer.statistics BufferServerStatistics DomainLink.lookup Player.resume Player.step RecorderStatistics
+    close_on_signal load_joint_states
 """
 """The public names without an example. A new name has one, so this list only shrinks."""
 
@@ -87,6 +83,9 @@ def results_of(module: str) -> doctest.TestResults:
     names = {"np": np, **{public: getattr(tfbus, public) for public in tfbus.__all__}}
     runner = doctest.DocTestRunner()
     for test in doctest.DocTestFinder(exclude_empty=True).find(importlib.import_module(module), extraglobs=names):
+        source = "".join(example.source for example in test.examples)
+        if any(word in source and find_spec(package) is None for word, package in OPTIONAL.items()):
+            continue
         with asyncio.Runner() as loop:
             test.globs["_await"] = functools.partial(awaited, loop, test.globs)
             for example in test.examples:
@@ -106,6 +105,10 @@ def awaited(loop: asyncio.Runner, names: dict[str, Any], source: str) -> None:
 def callables() -> dict[str, Any]:
     """The public classes, functions and methods, but for errors, by name."""
     found: dict[str, Any] = {}
+    # The methods that the reference leaves out, because tfbus calls them itself.
+    pages = [ROOT / "demos" / "guide" / "conf.py", *(ROOT / "demos" / "guide" / "reference").glob("*.rst")]
+    left_out = re.findall(r"exclude-members\W+([a-z_, ]+)", " ".join(page.read_text("utf-8") for page in pages))
+    internal = {name for names in left_out for name in names.split(", ")}
     for room in map(importlib.import_module, DOORS):
         own = [name for name, thing in vars(room).items() if getattr(thing, "__module__", "") == room.__name__]
         public = [(name, getattr(room, name)) for name in getattr(room, "__all__", own) if name[0] != "_"]
@@ -117,7 +120,7 @@ def callables() -> dict[str, Any]:
                 for method, value in vars(thing).items():
                     value = getattr(value, "__func__", value)
                     # The names of tf2, which raise an error, have no module.
-                    if not method.startswith("_") and callable(value):
+                    if not method.startswith("_") and callable(value) and method not in internal:
                         found[f"{name}.{method}"] = value
     return found
 

@@ -2,12 +2,21 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Annotated, Any
 
 import anyio
 import pytest
 
-from tfbus import Buffer, Bus, BusClosedError, ClockResetError, Transform, TransformBroadcaster, TransformError
+from tfbus import (
+    Buffer,
+    Bus,
+    BusClosedError,
+    ClockResetError,
+    Transform,
+    TransformBroadcaster,
+    TransformError,
+    TransformStamped,
+)
 from tfbus.web import close_on_signal, status_of
 
 pytestmark = pytest.mark.anyio
@@ -97,3 +106,30 @@ def test_in_another_thread_as_under_a_test_client_signals_are_left_alone() -> No
     thread.start()
     thread.join()
     assert handlers == [signal.getsignal(signal.SIGINT)]
+
+
+async def test_a_route_takes_and_gives_transforms_by_their_types() -> None:
+    fastapi = pytest.importorskip("fastapi", reason='pip install "tfbus[web]"')
+    httpx = pytest.importorskip("httpx")
+    with Bus() as bus, Buffer(bus) as buffer:
+        app = fastapi.FastAPI()
+
+        @app.post("/transforms")
+        async def publish(sample: Annotated[TransformStamped, fastapi.Body()]) -> None:
+            bus.publish(sample)
+
+        @app.get("/transforms")
+        async def look_up(target: str, source: str) -> TransformStamped:
+            return buffer.lookup_nowait(target, source)
+
+        sample = TransformStamped("map", "cart", 1_764_300_000_123_456_789, Transform((0.1, 0.2, 0.3)), "odometry")
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test") as client:
+            assert (await client.post("/transforms", json=sample.to_dict())).status_code == 200
+            found = await client.get("/transforms", params={"target": "map", "source": "cart"})
+            wrong = {**sample.to_dict(), "transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 9]}}
+            refused = await client.post("/transforms", json=wrong)
+            schema = (await client.get("/openapi.json")).json()["components"]["schemas"]["TransformStamped"]
+        assert TransformStamped.from_dict(found.json()) == buffer.lookup_nowait("map", "cart")
+        assert refused.status_code == 422
+        assert "0.0, 0.0, 0.0, 9.0" in refused.text or "quaternion" in refused.text
+        assert {"parent", "child", "stamp", "transform"} <= schema["properties"].keys()

@@ -96,22 +96,82 @@ class Clock(Protocol):
     """
 
     def now(self) -> int:
-        """The current stamp, in ns."""
+        """The current stamp, in ns.
+
+        Examples
+        --------
+        >>> clock: Clock = SimulatedClock(start=from_seconds(5.0))
+        >>> clock.now()
+        5000000000
+        """
 
     async def sleep(self, seconds: float) -> None:
-        """Sleep for a duration in s; jumps do not change it."""
+        """Sleep for a duration in s; jumps do not change it.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> async with anyio.create_task_group() as tasks:
+        ...     _ = tasks.start_soon(clock.advance, 10.0)
+        ...     await clock.sleep(2.5)
+        ...     print(clock.now())
+        2500000000
+        """
 
     async def sleep_until(self, stamp: int) -> None:
-        """Sleep until `now` has reached a stamp in ns; a jump back raises `ClockResetError`."""
+        """Sleep until `now` has reached a stamp in ns; a jump back raises `ClockResetError`.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> async with anyio.create_task_group() as tasks:
+        ...     _ = tasks.start_soon(clock.advance, 10.0)
+        ...     await clock.sleep_until(from_seconds(4.0))
+        ...     print(clock.now())
+        4000000000
+        """
 
     def ticks(self, hz: float) -> Ticks:
-        """Ticks at `hz` per second; jumps do not change their times."""
+        """Ticks at `hz` per second; jumps do not change their times.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> async with anyio.create_task_group() as tasks:
+        ...     _ = tasks.start_soon(clock.advance, 10.0)
+        ...     async for tick in clock.ticks(2.0):
+        ...         if tick == 3:
+        ...             break
+        >>> clock.now() >= from_seconds(1.5)
+        True
+        """
 
     def move_on_after(self, seconds: float) -> AbstractContextManager[anyio.CancelScope]:
-        """A ``with`` that cancels its body after a duration in s, as `anyio.move_on_after`."""
+        """A ``with`` that cancels its body after a duration in s, as `anyio.move_on_after`.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock()
+        >>> async with anyio.create_task_group() as tasks:
+        ...     _ = tasks.start_soon(clock.advance, 10.0)
+        ...     with clock.move_on_after(1.0) as scope:
+        ...         await anyio.sleep_forever()
+        >>> scope.cancelled_caught
+        True
+        """
 
     def on_jump(self, callback: JumpCallback) -> Registration:
-        """Call `callback` with the stamps before and after each jump, until the registration is closed."""
+        """Call `callback` with the stamps before and after each jump, until the registration is closed.
+
+        Examples
+        --------
+        >>> clock = SimulatedClock(start=from_seconds(5.0))
+        >>> jumps = []
+        >>> _ = clock.on_jump(lambda before, after: jumps.append((before, after)))
+        >>> clock.set(0)
+        >>> jumps
+        [(5000000000, 0)]
+        """
 
 
 class SystemClock:

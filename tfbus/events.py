@@ -61,7 +61,18 @@ class FrameRemoved(PlainData):
 
 @dataclass(frozen=True, slots=True)
 class Reparented(PlainData):
-    """The newest sample of a frame names another parent than the newest sample before it."""
+    """The newest sample of a frame names another parent than the newest sample before it.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.events() as events:
+    ...     for stamp, parent in ((0, "table"), (1, "gripper")):
+    ...         bus.publish(TransformStamped(parent, "box", stamp, Transform(), "hand"))
+    ...     bus.close()
+    ...     print([event async for event in events][-1])
+    0.000 s: frame 'box' moves from 'table' to 'gripper', says 'hand'
+    """
 
     stamp: int
     frame: str
@@ -76,7 +87,18 @@ class Reparented(PlainData):
 
 @dataclass(frozen=True, slots=True)
 class KindChanged(PlainData):
-    """A moving frame became static, or a static frame moving; `static` is the new kind."""
+    """A moving frame became static, or a static frame moving; `static` is the new kind.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.events() as events:
+    ...     for static in (True, False):
+    ...         bus.publish(TransformStamped("base", "lid", 1, Transform(), "robot", static))
+    ...     bus.close()
+    ...     print([event async for event in events][-1])
+    0.000 s: frame 'lid' is now moving, says 'robot'
+    """
 
     stamp: int
     frame: str
@@ -90,7 +112,18 @@ class KindChanged(PlainData):
 
 @dataclass(frozen=True, slots=True)
 class AuthorityConflict(PlainData):
-    """A sample of a frame came from `authority`, the sample before it from `other`."""
+    """A sample of a frame came from `authority`, the sample before it from `other`.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.events() as events:
+    ...     for authority in ("wheels", "camera"):
+    ...         bus.publish(TransformStamped("odom", "base", 1, Transform(), authority))
+    ...     bus.close()
+    ...     print([event async for event in events][-1])
+    0.000 s: frame 'base' comes from two authorities, 'camera' and 'wheels'
+    """
 
     stamp: int
     frame: str
@@ -119,6 +152,16 @@ class SampleRejected(PlainData):
         The child, the parent and the authority of the sample; None if the object was not a sample.
     error : Exception
         The error that was raised, or that the dropped sample would have raised.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.events() as events:
+    ...     too_far = TransformStamped("map", "base", 0, Transform((1e20, 0.0, 0.0)), "gps")
+    ...     bus.publish(too_far, invalid="drop")
+    ...     bus.close()
+    ...     print([(event.reason, event.frame) async for event in events])
+    [('not physical', 'base')]
     """
 
     stamp: int
@@ -150,6 +193,15 @@ class PastLoop(PlainData):
         The first stamp at which the loop holds, not before the stamp of the sample, in ns.
     loop : tuple of str
         The frames of the loop from child to parent, the first one repeated at the end.
+
+    Examples
+    --------
+    >>> with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer, bus.events() as events:
+    ...     for parent, child, stamp in (("a", "b", 100), ("map", "a", 200), ("b", "a", 50)):
+    ...         bus.publish(TransformStamped(parent, child, stamp, Transform(), "late"))
+    ...     bus.close()
+    ...     print([event async for event in events if type(event).__name__ == "PastLoop"])
+    [PastLoop(stamp=0, frame='a', parent='b', authority='late', at=100, loop=('a', 'b', 'a'))]
     """
 
     stamp: int
@@ -179,6 +231,17 @@ class FrameStale(PlainData):
         The frame, and the sender of its newest sample.
     newest : int
         The stamp of its newest sample, in ns.
+
+    Examples
+    --------
+    >>> bus = Bus(clock := SimulatedClock())
+    >>> with bus.events(stale_after=0.5) as events:
+    ...     bus.publish(TransformStamped("odom", "base", 0, Transform(), "wheels"))
+    ...     await clock.advance(1.0)
+    ...     arrived = aiter(events)
+    ...     _ = await anext(arrived)
+    ...     print(await anext(arrived))
+    1.000 s: frame 'base' is stale, its newest sample from 'wheels' is 1 s old
     """
 
     stamp: int
@@ -205,6 +268,18 @@ class FrameLive(PlainData):
         The frame, and the sender of its newest sample.
     newest : int or None
         The stamp of its newest sample, in ns; None if it became static.
+
+    Examples
+    --------
+    >>> bus = Bus(clock := SimulatedClock())
+    >>> with bus.events(stale_after=0.5) as events:
+    ...     bus.publish(TransformStamped("odom", "base", 0, Transform(), "wheels"))
+    ...     await clock.advance(1.0)
+    ...     arrived = aiter(events)
+    ...     _ = [await anext(arrived), await anext(arrived)]
+    ...     bus.publish(TransformStamped("odom", "base", clock.now(), Transform(), "wheels"))
+    ...     print(await anext(arrived))
+    1.000 s: frame 'base' is live again, from 'wheels'
     """
 
     stamp: int
@@ -232,6 +307,15 @@ class StampAhead(PlainData):
         The frame, and the sender of the sample.
     newest : int
         The stamp of the sample, in ns.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock(start=from_seconds(1.0)))
+    >>> with bus.events() as events:
+    ...     bus.publish(TransformStamped("odom", "base", from_seconds(3.0), Transform(), "laptop"))
+    ...     bus.close()
+    ...     print([event async for event in events][-1])
+    1.000 s: frame 'base' has a sample 2 s ahead of the clock, from 'laptop'
     """
 
     stamp: int
@@ -267,6 +351,15 @@ class StampBehind(PlainData):
     newest : int or None
         If the sample has expired: the newest stamp of the frame, in ns, whose window does not reach back to the sample.
         None if the sample is behind the clock.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock(start=from_seconds(100.0)), max_behind=10.0)
+    >>> with bus.events() as events:
+    ...     bus.publish(TransformStamped("odom", "base", 0, Transform(), "laptop"))
+    ...     bus.close()
+    ...     print([event async for event in events][-1])
+    100.000 s: frame 'base' has a sample 100 s behind the clock, from 'laptop'
     """
 
     stamp: int
@@ -315,7 +408,18 @@ class ClockReset(PlainData):
 
 @dataclass(frozen=True, slots=True)
 class SubscriberFailed(PlainData):
-    """A subscriber's callback raised an `Exception`; `subscriber` is the callback's name."""
+    """A subscriber's callback raised an `Exception`; `subscriber` is the callback's name.
+
+    Examples
+    --------
+    >>> bus = Bus(SimulatedClock())
+    >>> with bus.events() as events:
+    ...     _ = bus.subscribe(lambda batch: 1 / 0)
+    ...     bus.publish(TransformStamped("odom", "base", 0, Transform()))
+    ...     bus.close()
+    ...     print([event async for event in events][-1])
+    0.000 s: the subscriber <lambda> raised ZeroDivisionError('division by zero')
+    """
 
     stamp: int
     subscriber: str
@@ -337,6 +441,15 @@ class PeerJoined(PlainData):
         The domain of the link.
     peer : str
         The identifier of the other bus, a new one each time it starts.
+
+    Examples
+    --------
+    >>> here = Bus()
+    >>> with here.events() as events:
+    ...     async with LocalLink(here, "cell7"), LocalLink(Bus(), "cell7"):
+    ...         joined = await anext(aiter(events))
+    >>> type(joined).__name__, joined.link
+    ('PeerJoined', 'cell7')
     """
 
     stamp: int
@@ -361,6 +474,17 @@ class PeerLost(PlainData):
         The authorities of the buses that were reached by the peer, sorted.
     frames : tuple of str
         The frames whose newest sample came from the peer, sorted; a link that drops lost frames removes them.
+
+    Examples
+    --------
+    >>> here = Bus()
+    >>> with here.events() as events:
+    ...     async with LocalLink(here, "cell8"):
+    ...         async with LocalLink(Bus(), "cell8"):
+    ...             _ = await anext(aiter(events))
+    ...         lost = await anext(aiter(events))
+    >>> type(lost).__name__, lost.frames
+    ('PeerLost', ())
     """
 
     stamp: int
@@ -388,6 +512,12 @@ class PeerRejected(PlainData):
         The key in the `rejected` of the link's statistics.
     error : Exception
         The reason for the rejection.
+
+    Examples
+    --------
+    >>> rejected = PeerRejected(0, "zenoh", "2f6b", "oversized", ValueError("5 MiB, more than 4 MiB"))
+    >>> print(rejected)
+    0.000 s: peer 2f6b on zenoh sent data that were refused: 5 MiB, more than 4 MiB
     """
 
     stamp: int
@@ -414,6 +544,11 @@ class RecordingDropped(PlainData):
         The recording.
     dropped : int
         Number of samples that were lost so far.
+
+    Examples
+    --------
+    >>> print(RecordingDropped(0, "run.mcap", 12))
+    0.000 s: the recording run.mcap is behind and loses samples, 12 so far
     """
 
     stamp: int
@@ -436,6 +571,11 @@ class RecordingFailed(PlainData):
         The recording.
     error : Exception
         The write error.
+
+    Examples
+    --------
+    >>> print(RecordingFailed(0, "run.mcap", OSError("no space left on device")))
+    0.000 s: the recording run.mcap has ended early: no space left on device
     """
 
     stamp: int

@@ -181,6 +181,12 @@ class LinkStatistics(Counts):
         Rejected messages and samples of peers, by reason.
     queue : QueueStatistics
         The received messages that wait for the event loop.
+
+    Examples
+    --------
+    >>> async with LocalLink(Bus(), "example") as link:
+    ...     print(link.statistics().lost)
+    0
     """
 
     peers: int
@@ -258,6 +264,14 @@ class RobotStatistics(Counts):
         Positions in them for joints that the robot does not have.
     violations : mapping of str to int
         Positions in them beyond the limits of the joint, by joint name.
+
+    Examples
+    --------
+    >>> model = RobotModel("rig", ["rail", "cart"], [Joint("slide", "prismatic", "rail", "cart")])
+    >>> publisher = RobotStatePublisher(Bus(SimulatedClock()), model)
+    >>> publisher.publish({"slide": 0.5, "tail": 1.0}, 0)
+    >>> publisher.statistics().unknown_joints
+    1
     """
 
     messages: int

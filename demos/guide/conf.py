@@ -99,7 +99,7 @@ autodoc_default_options = {
     # Members of Python's own classes are not documented again.
     "inherited-members": "BaseException, Enum, tuple, object",
     # The parts of a link call these.
-    "exclude-members": "receive, send_soon, stir, serve, lookups",
+    "exclude-members": "receive, send_soon, stir, is_behind, serve, lookups",
     "member-order": "bysource",
 }
 autodoc_typehints_format = "short"

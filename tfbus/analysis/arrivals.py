@@ -70,6 +70,15 @@ class Arrival:
     lost : int
         Samples that are missing between the stamps, by the median period; an estimate, for senders with a fixed rate
         only.
+
+    Examples
+    --------
+    >>> from tfbus.analysis import Arrivals
+    >>> arrivals = Arrivals(window=5.0)
+    >>> for stamp in range(0, SECOND, SECOND // 10):
+    ...     arrivals.note([TransformStamped("odom", "base", stamp, Transform(), "wheels")], stamp)
+    >>> [(arrival.frame, round(arrival.rate)) for arrival in arrivals.measure(SECOND)]
+    [('base', 10)]
     """
 
     frame: str

@@ -78,7 +78,18 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Statistics of errors, in m or rad; `std` is the standard deviation of the population."""
+    """Statistics of errors, in m or rad; `std` is the standard deviation of the population.
+
+    Examples
+    --------
+    >>> from tfbus.analysis import compare
+    >>> truth, slam = TransformTree(), TransformTree()
+    >>> for step in range(4):
+    ...     _ = truth.insert(TransformStamped("map", "base", step, Transform((float(step), 0.0, 0.0))))
+    ...     _ = slam.insert(TransformStamped("map", "base", step, Transform((float(step), 0.5, 0.0))))
+    >>> compare(truth, slam, "map", "base").absolute.statistics()[0].rmse
+    0.5
+    """
 
     rmse: float
     mean: float
@@ -166,6 +177,17 @@ class Comparison:
         The errors of the steps from one pose to a later one (RPE).
     reference, estimate : TransformArray
         The poses that were compared, with the stamps of the reference; the estimate after alignment.
+
+    Examples
+    --------
+    >>> from tfbus.analysis import compare
+    >>> truth, slam = TransformTree(), TransformTree()
+    >>> for step in range(4):
+    ...     _ = truth.insert(TransformStamped("map", "base", step, Transform((float(step), 0.0, 0.0))))
+    ...     _ = slam.insert(TransformStamped("map", "base", step, Transform((float(step), 0.5, 0.0))))
+    >>> found = compare(truth, slam, "map", "base")
+    >>> found.poses, found.absolute.translation
+    (4, array([0.5, 0.5, 0.5, 0.5]))
     """
 
     poses: int

@@ -247,7 +247,15 @@ class Transform:
 
     @classmethod
     def from_scipy(cls, translation: Numbers, rotation: Any) -> Transform:
-        """From a translation in m and one ``scipy.spatial.transform.Rotation``."""
+        """From a translation in m and one ``scipy.spatial.transform.Rotation``.
+
+        Examples
+        --------
+        >>> from scipy.spatial.transform import Rotation
+        >>> half_turn = Rotation.from_euler("z", 180.0, degrees=True)
+        >>> Transform.from_scipy((1.0, 0.0, 0.0), half_turn).apply((1.0, 0.0, 0.0))[0]
+        0.0
+        """
         return cls(translation, rotation.as_quat())
 
     @classmethod
@@ -337,6 +345,12 @@ class Transform:
         ------
         ImportError
             If scipy is not installed.
+
+        Examples
+        --------
+        >>> turn = Transform.from_xyz_rpy((0.0, 0.0, 0.0), (0.0, 0.0, 90.0), degrees=True)
+        >>> turn.as_scipy().as_euler("xyz", degrees=True).round(6) + 0.0
+        array([ 0.,  0., 90.])
         """
         from scipy.spatial.transform import Rotation
 

@@ -126,7 +126,15 @@ class TransformArray:
     def from_scipy(
         cls, translations: npt.ArrayLike, rotations: Any, stamps: StampsLike | None = None
     ) -> TransformArray:
-        """From translations in m, shape (n, 3), and n rotations in a ``scipy.spatial.transform.Rotation``."""
+        """From translations in m, shape (n, 3), and n rotations in a ``scipy.spatial.transform.Rotation``.
+
+        Examples
+        --------
+        >>> from scipy.spatial.transform import Rotation
+        >>> turns = Rotation.from_euler("z", [[0.0], [90.0]], degrees=True)
+        >>> TransformArray.from_scipy(np.zeros((2, 3)), turns, [10, 20])
+        <TransformArray of 2 from 0.00000001 s to 0.00000002 s>
+        """
         return cls(translations, rotations.as_quat(), stamps)
 
     @property
@@ -222,6 +230,12 @@ class TransformArray:
             If scipy is not installed.
         ValueError
             If a transform is NaN: select the valid ones first.
+
+        Examples
+        --------
+        >>> turns = TransformArray(np.zeros((2, 3)), [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]])
+        >>> np.degrees(turns.as_scipy().magnitude())
+        array([  0., 180.])
         """
         from scipy.spatial.transform import Rotation
 
@@ -251,6 +265,12 @@ class TransformArray:
             If the library is not installed.
         ValueError
             If it is another library, or another index, or there are no stamps for it.
+
+        Examples
+        --------
+        >>> steps = TransformArray([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]] * 2, [0, SECOND])
+        >>> steps.to_dataframe(index="datetime")["x_m"].diff().iloc[-1]
+        np.float64(1.0)
         """
         if library not in ("pandas", "polars"):
             raise ValueError(f"library must be 'pandas' or 'polars', not {library!r}")

@@ -220,6 +220,12 @@ class Link(AsyncOnly):
     BusClosedError, RuntimeError
         On entering, if the bus is closed; if it belongs to another thread, another link of it was entered in another
         event loop, or the link was entered before.
+
+    Examples
+    --------
+    >>> async with LocalLink(Bus(), "example") as link:
+    ...     print(link.statistics().peers)
+    0
     """
 
     def __init__(
@@ -500,6 +506,15 @@ class DomainLink(Link):
     Nothing here blocks the event loop: while the network is congested, live messages are dropped, which the other end
     counts as `lost`. Static frames, removals and the newest sample of each moving frame are recovered, as the guide's
     page on the protocol of links tells. A program that can reach the link can publish and remove any frame.
+
+    Examples
+    --------
+    >>> here, there = Bus(), Bus()
+    >>> async with LocalLink(here, "examples"), LocalLink(there, "examples"):
+    ...     with there.stream() as samples:
+    ...         here.publish(TransformStamped("map", "cart", 0, Transform(), static=True))
+    ...         print((await anext(aiter(samples)))[0].child)
+    cart
     """
 
     def __init__(

@@ -547,6 +547,17 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
             If it is one frame instead of a sequence, or the other way round.
         ValueError
             If the sequence is empty.
+
+        Examples
+        --------
+        >>> async def points():
+        ...     yield PointStamped("laser", 5, (1.0, 0.0, 0.0))
+        >>> with Bus() as bus, Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send_static("map", "laser", Transform((2.0, 0.0, 0.0)))
+        ...     async with MessageFilter(points(), buffer, "odom") as pairs:
+        ...         pairs.set_target("map")
+        ...         print([answer.parent async for _, answer in pairs])
+        ['map']
         """
         self._targets.replace(target)
         for pending in self._pending.waiting:

@@ -128,7 +128,14 @@ _NUMBERS = struct.Struct("<7d")
 
 @dataclass(frozen=True, slots=True)
 class StaticTransform:
-    """A static transform of a recording, with its numbers unchanged."""
+    """A static transform of a recording, with its numbers unchanged.
+
+    Examples
+    --------
+    >>> from tfbus.recording import StaticTransform
+    >>> StaticTransform("base_link", "laser", (0.1, 0.0, 0.2), (0.0, 0.0, 0.0, 1.0)).child
+    'laser'
+    """
 
     parent: str
     child: str

@@ -30,7 +30,14 @@ from tfbus.stamps import SECOND, STAMP_MAX, time_between, to_seconds
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """The mean, the 99th percentile and the maximum of some durations, in s. The percentile is exact to 1 %."""
+    """The mean, the 99th percentile and the maximum of some durations, in s. The percentile is exact to 1 %.
+
+    Examples
+    --------
+    >>> from tfbus.recording import Spread
+    >>> Spread(mean=0.02, p99=0.03, max=0.5).max
+    0.5
+    """
 
     mean: float
     p99: float

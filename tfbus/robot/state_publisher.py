@@ -127,6 +127,14 @@ class RobotStatePublisher:
             If there are not as many positions as names, or a name occurs twice.
         InvalidTransformError, BusClosedError, TypeError
             As `publish`.
+
+        Examples
+        --------
+        >>> model = RobotModel("rig", ["rail", "cart"], [Joint("slide", "prismatic", "rail", "cart")])
+        >>> with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        ...     RobotStatePublisher(bus, model).publish_state(["slide"], [0.5])
+        ...     print(buffer.lookup_nowait("rail", "cart").transform.translation)
+        (0.5, 0.0, 0.0)
         """
         if len(names) != len(positions):
             raise ValueError(f"there are {len(names)} names of joints, but {len(positions)} positions")
