@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 
 import anyio
+import numpy as np
 import pytest
 from support.samples import moving
 
@@ -17,6 +18,7 @@ from tfbus import (
     TransformBroadcaster,
     TransformStamped,
 )
+from tfbus.data import Odometry, PointStamped, PoseStamped, PoseWithCovarianceStamped, to_message
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 pytestmark = pytest.mark.anyio
@@ -38,6 +40,71 @@ def test_a_sample_has_the_stamp_of_the_clock_and_the_authority() -> None:
     assert {(sample.parent, sample.child, sample.transform, sample.authority) for sample in got} == {
         ("odom", "base", HERE, "odometry")
     }
+
+
+SECOND_ODOMETRY = Odometry("t265", 7, "base", HERE, (0.5, 0.0, 0.0), (0.0, 0.0, 0.1))
+
+
+@pytest.mark.parametrize("as_ros", [False, True])
+@pytest.mark.parametrize(
+    ("data", "child", "invert", "edges"),
+    [
+        (SECOND_ODOMETRY, None, False, [("t265", "r/base", (1.0, 2.0, 3.0))]),
+        (SECOND_ODOMETRY, None, True, [("r/base", "t265", (-1.0, -2.0, -3.0))]),
+        (PoseStamped("map", 7, HERE), "camera", False, [("map", "r/camera", (1.0, 2.0, 3.0))]),
+        (PoseStamped("map", 7, HERE), "camera", True, [("r/camera", "map", (-1.0, -2.0, -3.0))]),
+        (
+            PoseWithCovarianceStamped("map", 7, HERE, np.eye(6)),
+            "base",
+            False,
+            [("map", "r/base", (1.0, 2.0, 3.0))],
+        ),
+        (TransformStamped("map", "base", 7, HERE), None, True, [("r/base", "map", (-1.0, -2.0, -3.0))]),
+    ],
+)
+def test_a_message_is_sent_at_its_own_stamp_with_the_prefix_and_the_authority(
+    data: Odometry | PoseStamped | PoseWithCovarianceStamped | TransformStamped,
+    child: str | None,
+    invert: bool,
+    edges: list[tuple[str, str, tuple[float, ...]]],
+    as_ros: bool,
+) -> None:
+    bus = Bus(SimulatedClock(start=99))
+    got: list[TransformStamped] = []
+    bus.subscribe(got.extend)
+    broadcaster = TransformBroadcaster(bus, "slam", prefix="r/", shared={"map", "t265"})
+    broadcaster.send_message(to_message(data) if as_ros else data, child, invert=invert)
+    assert [(sample.parent, sample.child, sample.transform.translation) for sample in got] == edges
+    assert {(sample.stamp, sample.authority) for sample in got} == {(7, "slam")}
+
+
+def test_the_transforms_of_a_message_are_one_batch() -> None:
+    bus = Bus(SimulatedClock(start=0))
+    batches: list[tuple[TransformStamped, ...]] = []
+    bus.subscribe(batches.append)
+    samples = [TransformStamped("map", "odom", 1, HERE), TransformStamped("odom", "base", 2, HERE)]
+    TransformBroadcaster(bus).send_message(to_message(samples))
+    assert [[(each.child, each.stamp) for each in batch] for batch in batches] == [[("odom", 1), ("base", 2)]]
+
+
+@pytest.mark.parametrize(
+    ("message", "child", "words"),
+    [
+        (PoseStamped("map", 7, HERE), None, "give child="),
+        (SECOND_ODOMETRY, "camera", "child='camera' was given, but the message names its own: 'base'"),
+        (to_message(PointStamped("map", 7, (1.0, 2.0, 3.0))), None, "PointStamped does not say where a frame is"),
+        ({"number": 5}, None, "its fields are number"),
+    ],
+)
+def test_a_message_that_does_not_say_where_a_frame_is_is_refused(
+    message: object, child: str | None, words: str
+) -> None:
+    bus = Bus(SimulatedClock(start=0))
+    got: list[TransformStamped] = []
+    bus.subscribe(got.extend)
+    with pytest.raises(TypeError, match=words):
+        TransformBroadcaster(bus).send_message(message, child)
+    assert got == []
 
 
 @pytest.mark.parametrize("prefix", [None, "robot1/"])

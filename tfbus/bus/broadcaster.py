@@ -150,6 +150,41 @@ class TransformBroadcaster:
         stamp = self._stamp(at)
         self._to.publish([self._sample(sample, stamp) for sample in samples], self._invalid)
 
+    def send_message(self, message: object, child: str | None = None, *, invert: bool = False) -> None:
+        """Publish the transform that a message holds, such as odometry, or the pose of a frame, at its own stamp.
+
+        Parameters
+        ----------
+        message : object or mapping
+            A ``TransformStamped``, ``TFMessage``, ``Odometry``, ``PoseStamped`` or ``PoseWithCovarianceStamped`` of
+            ROS, as `tfbus.data.from_message` reads it, or data of `tfbus` with that name. A ``TFMessage`` is one batch.
+        child : str, optional
+            The frame that is at a pose. Needed for a pose, and refused for the others, which name it.
+        invert : bool
+            Whether the child becomes the parent: for a second source of odometry, whose body has a parent already.
+
+        Raises
+        ------
+        TypeError
+            If the message does not say where a frame is; or `child` is missing, or given although the message names it.
+        ValueError
+            As `tfbus.data.from_message`.
+        InvalidTransformError, BusClosedError
+            As `send`.
+
+        Examples
+        --------
+        >>> from tfbus.data import PoseStamped
+        >>> with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        ...     TransformBroadcaster(bus).send_message(PoseStamped("map", 5, Transform((1.0, 0.0, 0.0))), "camera")
+        ...     print(buffer.lookup_nowait("map", "camera").stamp)
+        5
+        """
+        # Only programs that send messages load the types of all messages.
+        from tfbus.data.messages import samples_of
+
+        self.send_all(samples_of(message, child, invert=invert))
+
     def send_columns(
         self,
         parents: Names,

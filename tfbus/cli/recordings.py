@@ -30,11 +30,18 @@ class TopicOptions:
         Read tf and tf_static of all namespaces; the frames of /robot1/tf get the prefix robot1/.
     prefix
         A prefix for the names of all frames.
+    odometry
+        Read this topic of nav_msgs/Odometry as transforms too; with =CHILD behind it, such as /camera/pose=camera, a
+        topic of poses. May be given several times.
+    invert
+        Make the child of the odometry the parent, because it has a parent already.
     """
 
     topic: tuple[str, ...] = ()
     namespaces: Flag = False
     prefix: str = ""
+    odometry: tuple[str, ...] = ()
+    invert: Flag = False
 
     def open(self, file: Path) -> Recording:
         """Open a recording.
@@ -52,12 +59,16 @@ class TopicOptions:
         """The options as arguments of `open_recording`; raises `UsageError` if they contradict each other."""
         if self.topic and self.namespaces:
             raise UsageError("--topic and --namespaces are two ways to choose: give one of them")
+        if self.invert and not self.odometry:
+            raise UsageError("--invert is for the topics of --odometry: give one")
         pairs = [topic.partition("=") for topic in self.topic]
         for prefix in (self.prefix, *(prefix for _, _, prefix in pairs)):
             if prefix.startswith("/"):
                 raise UsageError(f"a prefix must not start with '/', got {prefix!r}")
         topics = {name: prefix for name, _, prefix in pairs} or None
-        return {"topics": topics, "prefix": self.prefix, "namespaces": self.namespaces}
+        odometry = {name: child or None for name, _, child in (each.partition("=") for each in self.odometry)}
+        chosen = {"topics": topics, "prefix": self.prefix, "namespaces": self.namespaces}
+        return chosen | ({"odometry": odometry, "invert": self.invert} if odometry else {})
 
 
 DEFAULT_TOPICS = TopicOptions()

@@ -21,6 +21,7 @@ from tfbus.data.motion import (
     Odometry,
     TwistWithCovarianceStamped,
     VelocityStamped,
+    pose_as_transform,
 )
 from tfbus.data.paths import Path, PoseArray
 from tfbus.data.points import NavSatFix, PointStamped, Polygon, PoseStamped, QuaternionStamped, Vector3Stamped
@@ -293,6 +294,23 @@ def from_message(message: object) -> Any:
     known = message if isinstance(message, Mapping) else [name for name in dir(message) if not name.startswith("_")]
     shown = ", ".join(sorted(map(str, known))[:10])
     raise TypeError(f"a {type(message).__name__} is not a message that can be transformed; its fields are {shown}")
+
+
+def samples_of(message: object, child: str | None = None, *, invert: bool = False) -> list[TransformStamped]:
+    """The transforms of a message, or of stamped data, for `TransformBroadcaster.send_message`, which has the rules."""
+    known = (TransformStamped, Odometry, PoseStamped, PoseWithCovarianceStamped)
+    data = message if isinstance(message, known) else from_message(message)
+    if isinstance(data, PoseStamped | PoseWithCovarianceStamped):
+        if child is None:
+            raise TypeError(f"a {type(data).__name__} in {data.frame!r} does not say which frame is there: give child=")
+        return [pose_as_transform(data, child, invert=invert)]
+    samples = [data.as_transform()] if isinstance(data, Odometry) else data if isinstance(data, list) else [data]
+    if not all(isinstance(sample, TransformStamped) for sample in samples):
+        raise TypeError(f"a {type(data).__name__} does not say where a frame is, so it cannot be sent as a transform")
+    if child is not None:
+        names = ", ".join(repr(sample.child) for sample in samples)
+        raise TypeError(f"child={child!r} was given, but the message names its own: {names}")
+    return [~sample for sample in samples] if invert else samples
 
 
 def to_message(data: Data | Sequence[TransformStamped], like: Any = dict) -> Any:

@@ -20,7 +20,7 @@ from tfbus._aio.turn_budget import TurnBudget
 from tfbus.bus.bus import Bus
 from tfbus.clock import SimulatedClock
 from tfbus.errors import UnknownFrameError
-from tfbus.recording.recording import RecordedMessage, Recording, Selection, Topics, open_recording
+from tfbus.recording.recording import OdometryTopics, RecordedMessage, Recording, Selection, Topics, open_recording
 from tfbus.stamps import SECOND, as_stamp, from_seconds, is_real, to_seconds
 
 _BLOCK = 256
@@ -133,7 +133,7 @@ class Player:
         Whether to begin again at the end, for ever.
     since, until : int, optional
         The first and the last log time, in ns. The static transforms from before are played first.
-    topics, prefix, namespaces
+    topics, prefix, namespaces, odometry, invert
         As `open_recording`.
 
     Attributes
@@ -180,10 +180,18 @@ class Player:
         topics: Topics = None,
         prefix: str = "",
         namespaces: bool = False,
+        odometry: OdometryTopics = None,
+        invert: bool = False,
     ) -> None:
         # Wrong topics raise here, and not in `play`.
-        Selection(topics, prefix, namespaces)
-        self._chosen: dict[str, Any] = {"topics": topics, "prefix": prefix, "namespaces": namespaces}
+        Selection(topics, prefix, namespaces, odometry, invert)
+        self._chosen: dict[str, Any] = {
+            "topics": topics,
+            "prefix": prefix,
+            "namespaces": namespaces,
+            "odometry": odometry,
+            "invert": invert,
+        }
         _check_rate(rate)
         self._since = None if since is None else as_stamp(since)
         self._until = None if until is None else as_stamp(until)

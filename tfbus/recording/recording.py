@@ -36,6 +36,7 @@ from tfbus.recording.formats.transforms import (
     ColumnDecoder,
     Columns,
     holds_transforms,
+    needs_child,
 )
 from tfbus.rows import Row
 from tfbus.stamps import SECOND, is_real
@@ -75,6 +76,7 @@ MOVING_TOPIC: Final = "tf"
 STATIC_TOPIC: Final = "tf_static"
 
 Topics: TypeAlias = str | Iterable[str] | Mapping[str, str] | None
+OdometryTopics: TypeAlias = str | Iterable[str] | Mapping[str, str | None] | None
 
 
 class Choice(NamedTuple):
@@ -82,6 +84,8 @@ class Choice(NamedTuple):
 
     static: bool
     prefix: str
+    child: str | None = None
+    invert: bool = False
 
 
 class Selection:
@@ -96,6 +100,8 @@ class Selection:
         A prefix for the names of all frames.
     namespaces : bool
         Whether ``tf`` and ``tf_static`` in all namespaces are read, each under the prefix of its namespace.
+    odometry, invert
+        As `open_recording`.
 
     Raises
     ------
@@ -105,7 +111,21 @@ class Selection:
         If a topic or a prefix is not a string.
     """
 
-    def __init__(self, topics: Topics = None, prefix: str = "", namespaces: bool = False) -> None:
+    def __init__(
+        self,
+        topics: Topics = None,
+        prefix: str = "",
+        namespaces: bool = False,
+        odometry: OdometryTopics = None,
+        invert: bool = False,
+    ) -> None:
+        odometry = (odometry,) if isinstance(odometry, str) else odometry or ()
+        children = odometry if isinstance(odometry, Mapping) else dict.fromkeys(odometry)
+        self.odometry = {topic.removeprefix("/"): child for topic, child in children.items()}
+        self._invert = invert
+        for child in self.odometry.values():
+            if child is not None and not is_frame(child):
+                raise ValueError(f"the child of a pose must be the name of a frame, got {child!r}")
         if topics is not None and namespaces:
             raise ValueError("topics and namespaces are two ways to choose: give one of them")
         if isinstance(topics, str):
@@ -130,9 +150,11 @@ class Selection:
 
     def choose(self, channel: Channel) -> Choice | None:
         """The way in which a channel is read; None if it is not."""
+        name = channel.topic.removeprefix("/")
+        if name in self.odometry and needs_child(channel) is (self.odometry[name] is not None):
+            return Choice(False, self._prefix, self.odometry[name], self._invert)
         if not holds_transforms(channel):
             return None
-        name = channel.topic.removeprefix("/")
         namespace, _, last = name.rpartition("/")
         static = last == STATIC_TOPIC or (last.endswith("_static") and channel.type in TF_TYPES)
         own = last in (MOVING_TOPIC, STATIC_TOPIC)
@@ -385,7 +407,7 @@ class Recording:
         if choice is None:
             self._unwanted.add(channel)
         else:
-            self._decoders[channel] = ChannelDecoder(channel, choice.static, choice.prefix)
+            self._decoders[channel] = ChannelDecoder(channel, *choice)
         return choice is not None
 
     def _is_static(self, channel: Channel) -> bool:
@@ -417,6 +439,20 @@ class Recording:
                 with_transforms = sorted({each.topic for each in storage.channels if looks_like_transforms(each)})
                 why = f"has type {' and '.join(sorted(kinds))}, which holds no transforms" if kinds else "is not there"
                 there = f"; topics with transforms: {', '.join(with_transforms[:_SHOWN])}" if with_transforms else ""
+                raise RecordingError(f"topic {topic!r} {why}{there}", path=str(self.path), reason="no such topic")
+
+        for topic, child in self._selection.odometry.items() if storage.complete else ():
+            its = [each for each in storage.channels if each.topic.removeprefix("/") == topic]
+            if not any(needs_child(each) is (child is not None) for each in its):
+                its_types = " and ".join(sorted({each.type for each in its}))
+                why = "is not there"
+                if any(needs_child(each) is not None for each in its):
+                    fault = "needs the name of its child" if child is None else "names its child itself"
+                    why = f"of type {its_types} {fault}"
+                elif its:
+                    why = f"has type {its_types}, which is no odometry and no pose"
+                known = sorted({each.topic for each in storage.channels if needs_child(each) is not None})
+                there = f"; topics with odometry or poses: {', '.join(known[:_SHOWN])}" if known else ""
                 raise RecordingError(f"topic {topic!r} {why}{there}", path=str(self.path), reason="no such topic")
 
     def close(self) -> None:
@@ -457,7 +493,13 @@ def _remark_on_joints(topic: RecordedTopic) -> str:
 
 
 def open_recording(
-    path: str | os.PathLike[str], *, topics: Topics = None, prefix: str = "", namespaces: bool = False
+    path: str | os.PathLike[str],
+    *,
+    topics: Topics = None,
+    prefix: str = "",
+    namespaces: bool = False,
+    odometry: OdometryTopics = None,
+    invert: bool = False,
 ) -> Recording:
     """Open a recording of ROS 1 (``.bag``), of ROS 2 (a folder, ``.db3``, ``.mcap``) or of Foxglove (``.mcap``).
 
@@ -476,6 +518,11 @@ def open_recording(
         A prefix for the names of all frames.
     namespaces : bool
         Read ``tf`` and ``tf_static`` of all namespaces; the frames of ``/robot1/tf`` get the prefix ``robot1/``.
+    odometry : str, iterable of str, or mapping of str to str, optional
+        Topics of ``nav_msgs/Odometry`` that are read as transforms, beside the others; with the name of the child also
+        ``PoseStamped`` and ``PoseWithCovarianceStamped``: ``{"/odom": None, "/camera/pose": "camera"}``.
+    invert : bool
+        Whether the child of each odometry becomes the parent, because it has a parent already.
 
     Raises
     ------
@@ -507,7 +554,7 @@ def open_recording(
     993
     """
     file = Path(path)
-    selection = Selection(topics, prefix, namespaces)
+    selection = Selection(topics, prefix, namespaces, odometry, invert)
     storage = open_storage(file)
     try:
         return Recording(file, storage, selection)
@@ -702,6 +749,8 @@ def load(
     topics: Topics = None,
     prefix: str = "",
     namespaces: bool = False,
+    odometry: OdometryTopics = None,
+    invert: bool = False,
     max_speed: float | None = None,
     problems: Counter[str] | None = None,
     max_translation: float = MAX_TRANSLATION,
@@ -717,7 +766,7 @@ def load(
         As `open_recording`.
     since, until : int, optional
         The first and the last log time, in ns. Static transforms from before `since` are in the tree as well.
-    topics, prefix, namespaces
+    topics, prefix, namespaces, odometry, invert
         As `open_recording`.
     max_speed : float, optional
         In m/s. A moving sample is left out, and counted as ``"speed"``, if its frame cannot have come there from its
@@ -751,7 +800,9 @@ def load(
     limit = None if max_speed is None else SpeedLimit(max_speed)
     found = Problems()
     tree = TransformTree(keep=None, max_translation=max_translation)
-    with open_recording(path, topics=topics, prefix=prefix, namespaces=namespaces) as recording:
+    with open_recording(
+        path, topics=topics, prefix=prefix, namespaces=namespaces, odometry=odometry, invert=invert
+    ) as recording:
         fill(tree, recording, found, since, until, limit=limit)
         remarks = recording.remarks
     if problems is not None:

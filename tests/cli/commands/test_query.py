@@ -12,8 +12,10 @@ from support.commands import Command, check_wrong_call
 from support.recorded import SMALL, Line, write_mcap
 from support.samples import moving, static
 
+from tfbus import Transform, TransformStamped
 from tfbus.cli.commands.query import Row, print_rows
 from tfbus.recording import load
+from tfbus.tf_message import encode
 
 SECOND = 1_000_000_000
 EPOCH = 1_700_000_000_123_456_789
@@ -277,3 +279,14 @@ def test_where_a_line_does_not_fit_the_quaternion_is_on_a_second_one(
         # All of one width, however large.
         assert width < 104 or lines[-1].endswith(numbers)
     assert heights == {60: 4, 103: 4, 104: 2}
+
+
+def test_poses_of_a_recording_are_read_as_the_transforms_of_a_frame(tmp_path: Path, tfbus: Command) -> None:
+    transform = encode([TransformStamped("map", "?", 5 * SECOND, Transform((1.0, 2.0, 3.0)))])
+    # A pose has no child, and no number of transforms before it: a header, "map" and its numbers.
+    pose = transform[:4] + transform[8:16] + transform[16:24] + transform[-56:]
+    path = write_mcap(tmp_path / "run.mcap", [(0, "/pose", pose)], schema="geometry_msgs/msg/PoseStamped")
+    done = tfbus("query", path, "camera", "map", "--csv", "--odometry", "/pose=camera", "--invert")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[1].startswith("5000000000,-1.0,-2.0,-3.0,")
+    check_wrong_call(tfbus("query", path, "camera", "map", "--invert"), "--invert is for the topics of --odometry")

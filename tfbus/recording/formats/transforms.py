@@ -72,8 +72,51 @@ def holds_transforms(channel: Channel) -> bool:
     return channel.type in FOXGLOVE_TYPES and channel.encoding in ("cdr", "ros1", "protobuf", "json")
 
 
-def parser_of(channel: Channel) -> Callable[[bytes], list[RawTransform]]:
-    """The function that parses the messages of a channel; it raises `MalformedMessageError`."""
+# The bytes behind the seven numbers of the pose: 36 of a covariance, and for odometry a twist and its covariance.
+_ODOMETRY: Final = {f"nav_msgs/{kind}Odometry": 8 * (36 + 6 + 36) for kind in ("msg/", "")}
+_POSES: Final = {
+    f"geometry_msgs/{kind}{name}": size
+    for kind in ("msg/", "")
+    for name, size in (("PoseStamped", 0), ("PoseWithCovarianceStamped", 8 * 36))
+}
+
+
+def needs_child(channel: Channel) -> bool | None:
+    """Whether the messages of a channel are poses without the name of a child; None if they are not odometry either."""
+    if channel.encoding not in ("cdr", "ros1"):
+        return None
+    return True if channel.type in _POSES else False if channel.type in _ODOMETRY else None
+
+
+def _pose_parser(channel: Channel, child: str | None) -> Callable[[bytes], list[RawTransform]]:
+    """The parser of odometry and poses: up to their numbers they are laid out as one transform."""
+    is_cdr = channel.encoding == "cdr"
+    behind = _ODOMETRY.get(channel.type) or _POSES.get(channel.type, 0)
+
+    def parse(payload: bytes) -> list[RawTransform]:
+        end = len(payload) - behind
+        if end < 16:
+            raise MalformedMessageError("truncated", f"{len(payload)} bytes are too few")
+        message = payload[:end]
+        if child is not None:
+            order = ">" if is_cdr and payload[1:2] == b"\0" else "<"
+            (length,) = struct.unpack_from(f"{order}I", message, 12)
+            at = 16 + length
+            start = at + (4 - at) % 8 if is_cdr else at
+            if start + 56 != end:
+                raise MalformedMessageError("truncated", f"{len(payload)} bytes do not hold one pose")
+            name = child.encode() + bytes(is_cdr)
+            head = message[:at] + bytes(-at % 4 if is_cdr else 0) + struct.pack(f"{order}I", len(name)) + name
+            message = head + bytes((4 - len(head)) % 8 if is_cdr else 0) + message[start:]
+        return _parse_cdr(message, True) if is_cdr else _parse_ros1(message, True, True)
+
+    return parse
+
+
+def parser_of(channel: Channel, child: str | None = None) -> Callable[[bytes], list[RawTransform]]:
+    """The function that parses the messages of a channel, poses with a `child`; it raises `MalformedMessageError`."""
+    if needs_child(channel) is not None:
+        return _pose_parser(channel, child)
     single = channel.type.endswith("FrameTransform")
     if channel.encoding == "json":
         return lambda payload: _parse_json(payload, single)
@@ -283,6 +326,10 @@ class ChannelDecoder:
         Whether its transforms are static.
     prefix : str
         A prefix for the names of all frames, after leading slashes are removed.
+    child : str, optional
+        The frame that is at the poses of a channel without it.
+    invert : bool
+        Whether the child of odometry becomes the parent.
 
     Attributes
     ----------
@@ -297,18 +344,22 @@ class ChannelDecoder:
         `tfbus.tf_message.plain_decoder`. None where no message is plain.
     """
 
-    def __init__(self, channel: Channel, static: bool, prefix: str = "") -> None:
+    def __init__(
+        self, channel: Channel, static: bool, prefix: str = "", child: str | None = None, invert: bool = False
+    ) -> None:
         self.channel = channel
         self.static = static
         self.prefix = prefix
         self.authorities: tuple[Run, ...] = _authorities(channel)
         self._count = sum(count for _, count in self.authorities)
-        self._is_cdr = channel.encoding == "cdr" and not channel.type.endswith("FrameTransform")
+        is_pose = needs_child(channel) is not None
+        self._invert = invert and is_pose
+        self._is_cdr = channel.encoding == "cdr" and not channel.type.endswith("FrameTransform") and not is_pose
         # The usual case, and several times as fast.
         self.decode_plain: Callable[[bytes], tuple[TransformStamped, ...] | None] | None = None
         if self._is_cdr and not prefix and len(self.authorities) == 1:
             self.decode_plain = plain_decoder((self.authorities[0][0], static), MAX_MESSAGE)
-        self.parse: Callable[[bytes], list[RawTransform]] = parser_of(channel)
+        self.parse: Callable[[bytes], list[RawTransform]] = parser_of(channel, child)
         self._single: set[bytes] = set()
         self._names: dict[tuple[str, str], tuple[str, str]] = {}
 
@@ -327,6 +378,8 @@ class ChannelDecoder:
         decoded = decode(payload, self._tags(count), bare_names=True)
         if self.prefix:
             decoded.samples[:] = map(self._prefixed, decoded.samples)
+        if self._invert:
+            decoded.samples[:] = [sample and ~sample for sample in decoded.samples]
         return decoded
 
     def count(self, payload: bytes) -> int:
