@@ -114,14 +114,14 @@ async def test_a_route_takes_and_gives_transforms_by_their_types() -> None:
     with Bus() as bus, Buffer(bus) as buffer:
         app = fastapi.FastAPI()
 
-        @app.post("/transforms")
         async def publish(sample: Annotated[TransformStamped, fastapi.Body()]) -> None:
             bus.publish(sample)
 
-        @app.get("/transforms")
         async def look_up(target: str, source: str) -> TransformStamped:
             return buffer.lookup_nowait(target, source)
 
+        app.post("/transforms")(publish)
+        app.get("/transforms")(look_up)
         sample = TransformStamped("map", "cart", 1_764_300_000_123_456_789, Transform((0.1, 0.2, 0.3)), "odometry")
         async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test") as client:
             assert (await client.post("/transforms", json=sample.to_dict())).status_code == 200
