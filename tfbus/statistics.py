@@ -216,6 +216,18 @@ class BufferServerStatistics(Counts):
     refused : mapping of str to int
         Questions that were refused, by reason: ``"busy"``, because too many wait or arrive; ``"malformed"``;
         ``"internal"``, because of an error that lookups do not raise, which is logged.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from tfbus.links import BufferServer
+    >>> robot, folder = Bus(), tempfile.mkdtemp()
+    >>> async with LocalLink(robot, directory=folder) as link, BufferServer(Buffer(robot), link) as server:
+    ...     robot.publish(TransformStamped("map", "cart", 0, Transform((2.0, 0.0, 0.0)), static=True))
+    ...     async with LocalLink(Bus(), directory=folder) as asker:
+    ...         _ = await asker.lookup("map", "cart", timeout=5.0)
+    ...     print(server.statistics().answered)
+    1
     """
 
     waiting: int
@@ -243,6 +255,17 @@ class RecorderStatistics(Counts):
     queue : QueueStatistics
         The samples that wait for the disk. Dropped samples were lost because the disk was too slow or failed; a
         conflated sample is a static one that a newer sample of the same child replaced in a full queue.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> from tfbus.recording import Recorder
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> async with Recorder(bus := Bus(SimulatedClock()), pathlib.Path(folder.name) / "run.mcap") as recorder:
+    ...     bus.publish(TransformStamped("map", "cart", 0, Transform(), "wheels"))
+    >>> recorder.statistics().samples
+    1
+    >>> folder.cleanup()
     """
 
     samples: int

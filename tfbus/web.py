@@ -92,12 +92,14 @@ def close_on_signal(*closing: _Closable) -> Iterator[None]:
 
     Examples
     --------
-    ::
-
-        @contextlib.asynccontextmanager
-        async def lifespan(app):
-            with tfbus.Bus() as bus, tfbus.Buffer(bus) as app.state.buffer, tfbus.web.close_on_signal(app.state.buffer):
-                yield
+    >>> import contextlib, tfbus, tfbus.web
+    >>> @contextlib.asynccontextmanager
+    ... async def lifespan(app):
+    ...     with tfbus.Bus() as bus, tfbus.Buffer(bus) as buffer, tfbus.web.close_on_signal(buffer):
+    ...         yield {"buffer": buffer}
+    >>> async with lifespan(None) as state:
+    ...     print(state["buffer"])
+    <Buffer of 0 frames, keeps 10 s, 0 lookups waiting>
     """
     loop: Any = anyio.lowlevel.current_token().native_token
     # Of all functions of a loop, only these wake it from a signal handler.

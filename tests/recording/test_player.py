@@ -403,6 +403,13 @@ def test_a_pause_and_a_new_rate_count_from_their_moment(
     assert times_in(path, steer, simulated=simulated) == pytest.approx(expected, abs=1e-6)
 
 
+def test_a_player_can_be_paused_and_go_on_before_any_event_loop_runs(tmp_path: Path) -> None:
+    player = Player(Bus(), write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0))))
+    player.pause()
+    player.resume()
+    assert not player.paused
+
+
 @pytest.mark.parametrize("simulated", [True, False])
 @pytest.mark.parametrize(
     ("goes_on", "left"),

@@ -585,6 +585,17 @@ class DomainLink(Link):
             As `tfbus.Buffer.lookup` there: the same error, with its facts.
         RuntimeError
             If 10,000 lookups wait already, or the link is not entered in this event loop.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from tfbus.links import BufferServer
+        >>> robot, folder = Bus(), tempfile.mkdtemp()
+        >>> async with LocalLink(robot, directory=folder) as link, BufferServer(Buffer(robot), link) as server:
+        ...     robot.publish(TransformStamped("map", "cart", 0, Transform((2.0, 0.0, 0.0)), static=True))
+        ...     async with LocalLink(Bus(), directory=folder) as asker:
+        ...         print((await asker.lookup("map", "cart", timeout=5.0)).transform.translation)
+        (2.0, 0.0, 0.0)
         """
         policy_of(tolerance, max_gap, extrapolate)
         limit = math.inf if timeout is None else as_duration(timeout, "timeout")

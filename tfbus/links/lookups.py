@@ -294,7 +294,20 @@ class BufferServer(AsyncOnly):
         self._tasks: anyio.abc.TaskGroup | None = None
 
     def statistics(self) -> BufferServerStatistics:
-        """All counters, as they are now."""
+        """All counters, as they are now.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from tfbus.links import BufferServer
+        >>> robot, folder = Bus(), tempfile.mkdtemp()
+        >>> async with LocalLink(robot, directory=folder) as link, BufferServer(Buffer(robot), link) as server:
+        ...     robot.publish(TransformStamped("map", "cart", 0, Transform((2.0, 0.0, 0.0)), static=True))
+        ...     async with LocalLink(Bus(), directory=folder) as asker:
+        ...         _ = await asker.lookup("map", "cart", timeout=5.0)
+        ...     print(server.statistics().answered)
+        1
+        """
         counts = self._counts
         return BufferServerStatistics(
             waiting=len(self._waiting),

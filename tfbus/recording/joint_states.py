@@ -55,6 +55,16 @@ def load_joint_states(
         If the recording cannot be read, or nothing of that type is on the topic.
     InvalidRobotError, OSError, ImportError
         As `RobotModel.from_urdf`.
+
+    Examples
+    --------
+    >>> from tfbus.recording import load_joint_states
+    >>> model = RobotModel("rig", ["rail", "cart"], [Joint("slide", "prismatic", "rail", "cart")])
+    >>> try:
+    ...     tree = load_joint_states("small.bag", model, "/arm/joint_states")
+    ... except RecordingError as error:
+    ...     print(error.reason)
+    no such topic
     """
     model = robot if isinstance(robot, RobotModel) else RobotModel.from_urdf(robot)
     counted = Problems()

@@ -314,15 +314,41 @@ class Player:
             self._paused = True
 
     def resume(self) -> None:
-        """Go on after a pause."""
+        """Go on after a pause.
+
+        Examples
+        --------
+        >>> from tfbus.recording import Player
+        >>> player = Player(Bus(SimulatedClock()), "small.bag", rate=1000.0)
+        >>> player.pause()
+        >>> player.resume()
+        >>> await player.play()
+        >>> player.paused, player.messages > 100
+        (False, True)
+        """
         if self._paused:
             self._paused = False
             self._steps = 0
-            self._origin_time = anyio.current_time()
+            if self._playing:
+                self._origin_time = anyio.current_time()
             self._stir()
 
     def step(self) -> None:
-        """Pause, and play the next message at once; each call plays one more message."""
+        """Pause, and play the next message at once; each call plays one more message.
+
+        Examples
+        --------
+        >>> from tfbus.recording import Player
+        >>> player = Player(Bus(SimulatedClock()), "small.bag", rate=1000.0)
+        >>> player.step()
+        >>> async with anyio.create_task_group() as tasks:
+        ...     _ = tasks.start_soon(player.play)
+        ...     while player.messages < 1:
+        ...         await anyio.sleep(0.01)
+        ...     tasks.cancel_scope.cancel()
+        >>> player.messages, player.paused
+        (1, True)
+        """
         self.pause()
         self._steps += 1
         self._stir()
