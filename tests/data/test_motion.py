@@ -149,3 +149,12 @@ def test_poses_and_paths_are_moved_one_by_one() -> None:
         Path("source", 5, *rows, [1, 2, 3])
     with pytest.raises(ValueError, match="read-only"):
         particles.positions[0, 0] = 5.0
+
+
+def test_a_velocity_that_is_missing_is_refused_and_a_measurement_that_is_missing_stays() -> None:
+    with pytest.raises(TypeError, match="linear must be three numbers, not None"):
+        Odometry("odom", 0, "base", Transform(), None, ANGULAR)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="center must be three numbers, not None"):
+        InertiaStamped("base", 0, 1.0, None, np.eye(3))  # type: ignore[arg-type]
+    imu = Imu("imu", 0, None, None, LINEAR)
+    assert (imu.angular_velocity, imu.linear_acceleration) == (None, LINEAR)

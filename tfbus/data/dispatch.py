@@ -280,3 +280,9 @@ def as_triple(value: Any, name: str) -> Vector:
         raise TypeError(f"{name} must be three numbers, not {value!r}") from None
     x, y, z = value
     return float(x), float(y), float(z)
+
+
+def set_triples(data: object, *names: str) -> None:
+    """Convert some fields of a frozen dataclass under construction by `as_triple`."""
+    for name in names:
+        object.__setattr__(data, name, as_triple(getattr(data, name), name))

@@ -9,11 +9,11 @@ import numpy.typing as npt
 from tfbus.data.dispatch import (
     CopiedByFields,
     as_covariance,
-    as_triple,
     check_header,
     check_pose,
     do_transform,
     moved_header,
+    set_triples,
 )
 from tfbus.data.spatial import lever, rotated, shifted
 from tfbus.frames import check_frame
@@ -23,13 +23,6 @@ from tfbus.geometry.transform_array import locked
 from tfbus.plain import PlainData
 from tfbus.rows import Quaternion, Vector, as_rotation, rotate
 from tfbus.stamps import Latest, as_array
-
-
-def _set_triples(data: object, *names: str) -> None:
-    for name in names:
-        value = getattr(data, name)
-        if value is not None:
-            object.__setattr__(data, name, as_triple(value, name))
 
 
 def _set_covariances(data: object, size: int, *names: str) -> None:
@@ -88,7 +81,7 @@ class Odometry(CopiedByFields, PlainData):
         check_header(self)
         check_frame(self.child)
         check_pose(self.pose)
-        _set_triples(self, "linear", "angular")
+        set_triples(self, "linear", "angular")
         _set_covariances(self, 6, "pose_covariance", "twist_covariance")
 
     def as_transform(self, *, invert: bool = False) -> TransformStamped:
@@ -157,7 +150,7 @@ class TwistWithCovarianceStamped(CopiedByFields, PlainData):
 
     def __post_init__(self) -> None:
         check_header(self)
-        _set_triples(self, "linear", "angular")
+        set_triples(self, "linear", "angular")
         _set_covariances(self, 6, "covariance")
 
 
@@ -205,7 +198,7 @@ class VelocityStamped(PlainData):
         check_header(self)
         check_frame(self.body)
         check_frame(self.reference)
-        _set_triples(self, "linear", "angular")
+        set_triples(self, "linear", "angular")
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +236,7 @@ class AccelStamped(PlainData):
 
     def __post_init__(self) -> None:
         check_header(self)
-        _set_triples(self, "linear", "angular")
+        set_triples(self, "linear", "angular")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -297,7 +290,8 @@ class Imu(CopiedByFields, PlainData):
         check_header(self)
         if self.orientation is not None:
             object.__setattr__(self, "orientation", as_rotation(self.orientation, "orientation"))
-        _set_triples(self, "angular_velocity", "linear_acceleration")
+        measured = ("angular_velocity", "linear_acceleration")
+        set_triples(self, *(name for name in measured if getattr(self, name) is not None))
         _set_covariances(
             self, 3, "orientation_covariance", "angular_velocity_covariance", "linear_acceleration_covariance"
         )
@@ -340,7 +334,7 @@ class InertiaStamped(CopiedByFields, PlainData):
     def __post_init__(self) -> None:
         check_header(self)
         object.__setattr__(self, "mass", float(self.mass))
-        _set_triples(self, "center")
+        set_triples(self, "center")
         inertia = as_array(self.inertia, "inertia", np.float64)
         if inertia.shape != (3, 3):
             raise ValueError(f"inertia must have shape (3, 3), got {inertia.shape}")

@@ -10,12 +10,12 @@ import numpy.typing as npt
 from tfbus.data.dispatch import (
     CopiedByFields,
     as_covariance,
-    as_triple,
     check_header,
     check_pose,
     construct,
     do_transform,
     moved_header,
+    set_triples,
 )
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
@@ -107,8 +107,7 @@ class TwistStamped(PlainData):
 
     def __post_init__(self) -> None:
         check_header(self)
-        object.__setattr__(self, "linear", as_triple(self.linear, "linear"))
-        object.__setattr__(self, "angular", as_triple(self.angular, "angular"))
+        set_triples(self, "linear", "angular")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,8 +179,7 @@ class WrenchStamped(PlainData):
 
     def __post_init__(self) -> None:
         check_header(self)
-        object.__setattr__(self, "force", as_triple(self.force, "force"))
-        object.__setattr__(self, "torque", as_triple(self.torque, "torque"))
+        set_triples(self, "force", "torque")
 
 
 @do_transform.register
