@@ -96,7 +96,7 @@ EXTRAS = {
     "trimesh": ("view",),
     "urdf_parser_py": ("robot",),
     "viser": ("view",),
-    "wsproto": ("links.rosbridge",),
+    "wsproto": ("_aio.websocket", "links.rosbridge"),
     "zenoh": ("links.rmw_zenoh", "links.zenoh"),
     "zstandard": ("recording.formats",),
 }

@@ -21,7 +21,8 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from tfbus import SECOND, Bus, BusClosedError, SimulatedClock, Transform, TransformStamped
-from tfbus.links.foxglove import MAX_CONNECTIONS, FoxgloveServer
+from tfbus._aio.web_server import MAX_CONNECTIONS
+from tfbus.links.foxglove import FoxgloveServer
 
 pytestmark = pytest.mark.anyio
 

@@ -16,8 +16,8 @@ import anyio.abc
 import anyio.to_thread
 
 from tfbus._aio.loops import LoopWaker
-from tfbus._aio.task_groups import close_task_group
-from tfbus._aio.web_door import HEAD_END, HEAD_TIME, MAX_HEAD, WebDoor
+from tfbus._aio.web_door import WebDoor
+from tfbus._aio.web_server import WebServer
 from tfbus.bus.bus import Bus
 from tfbus.errors import BusClosedError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
@@ -34,7 +34,6 @@ except ImportError as error:
 
 APPLICATION = ("https://app.foxglove.dev", "https://studio.foxglove.dev", "file://")
 """The origins of the Foxglove application: in a browser, and on the desktop."""
-MAX_CONNECTIONS = 100
 _CHUNK = 65_536
 """Bytes that are passed on at once."""
 _STAMP_END = 2**32 * SECOND
@@ -100,10 +99,8 @@ class FoxgloveServer(AsyncOnly):
         self.address: str = ""
         self.sent: int = 0
         self.not_sent: int = 0
-        self._host, self._port, self._topic = host, port, topic
-        self._door = WebDoor(host, origins)
-        self._connections = 0
-        self._too_many = 0
+        self._topic = topic
+        self._front = WebServer(host, port, WebDoor(host, origins), self._pass_in)
         self._entered = False
         self._listener = _Listener(self._wake)
         self._waker = LoopWaker(self._follow_subscriptions)
@@ -115,13 +112,11 @@ class FoxgloveServer(AsyncOnly):
         self._server: WebSocketServer | None = None
         self._never_entered = warn_unless_entered(self)
         self._inside = ("", 0)
-        self._front: anyio.abc.Listener[anyio.abc.SocketStream]
-        self._tasks: anyio.abc.TaskGroup
 
     @property
     def refused(self) -> int:
         """Connections that were refused."""
-        return self._door.refused + self._too_many
+        return self._front.refused
 
     async def __aenter__(self) -> Self:
         if self._entered:
@@ -133,30 +128,22 @@ class FoxgloveServer(AsyncOnly):
         self.bus._entered.add(self)
         self._never_entered.detach()
         self._waker.bind()
-        # A cancellation must not lose a server that a thread has started.
-        with anyio.CancelScope(shield=True):
-            try:
-                self._front = await anyio.create_tcp_listener(local_host=self._host, local_port=self._port)
-            except OSError as error:
-                raise OSError(f"cannot listen at {self._host}:{self._port}: {error}") from error
         try:
+            # A cancellation must not lose a server that a thread has started.
             with anyio.CancelScope(shield=True):
                 self._server = await anyio.to_thread.run_sync(self._start)
-            self._tasks = await anyio.create_task_group().__aenter__()
-            self._tasks.start_soon(self._serve)
+            await self._front.__aenter__()
         except BaseException:
             await self._stop()
             raise
-        port = self._front.extra(anyio.abc.SocketAttribute.local_port)
-        self.address = f"ws://{f'[{self._host}]' if ':' in self._host else self._host}:{port}"
+        self.address = f"ws://{self._front.place}"
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._tasks.cancel_scope.cancel()
         try:
-            await close_task_group(self._tasks)
+            await self._front.__aexit__(None, None, None)
         finally:
             await self._stop()
 
@@ -165,9 +152,8 @@ class FoxgloveServer(AsyncOnly):
         self.bus._entered.discard(self)
         server, self._server = self._server, None
         self._unsubscribe()
-        with anyio.CancelScope(shield=True):
-            await self._front.aclose()
-            if server is not None:
+        if server is not None:
+            with anyio.CancelScope(shield=True):
                 await anyio.to_thread.run_sync(server.stop)
 
     def _start(self) -> WebSocketServer:
@@ -190,30 +176,13 @@ class FoxgloveServer(AsyncOnly):
                 return server
         raise OSError(f"cannot listen at the loopback: {failure}") from failure
 
-    async def _serve(self) -> None:
-        await self._front.serve(self._admit)
-
-    async def _admit(self, outside: anyio.abc.SocketStream) -> None:
-        """Judge the head of a connection, and pass on what comes after it, in both directions."""
-        async with outside:
-            if self._connections == MAX_CONNECTIONS:
-                self._too_many += 1
-                return
-            self._connections += 1
-            try:
-                with suppress(anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError, OSError):
-                    head = await _head_of(outside)
-                    answer = self._door.answer(head)
-                    if answer is not None:
-                        await outside.send(answer)
-                        return
-                    async with await anyio.connect_tcp(*self._inside) as inside:
-                        await inside.send(head)
-                        async with anyio.create_task_group() as tasks:
-                            tasks.start_soon(_pass_on, outside, inside, tasks.cancel_scope)
-                            tasks.start_soon(_pass_on, inside, outside, tasks.cancel_scope)
-            finally:
-                self._connections -= 1
+    async def _pass_in(self, outside: anyio.abc.SocketStream, head: bytes) -> None:
+        """Pass on a connection to the library's server, in both directions."""
+        async with await anyio.connect_tcp(*self._inside) as inside:
+            await inside.send(head)
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(_pass_on, outside, inside, tasks.cancel_scope)
+                tasks.start_soon(_pass_on, inside, outside, tasks.cancel_scope)
 
     def _wake(self) -> None:
         try:
@@ -283,15 +252,6 @@ class _Listener(ServerListener):
         with self._lock:
             self.subscribers -= {client.id}
         self._changed()
-
-
-async def _head_of(stream: anyio.abc.ByteReceiveStream) -> bytes:
-    """The first bytes of a stream, with the head of a request; without it, if that is too long or comes too late."""
-    head = b""
-    with anyio.move_on_after(HEAD_TIME):
-        while HEAD_END not in head and len(head) <= MAX_HEAD:
-            head += await stream.receive(MAX_HEAD)
-    return head
 
 
 async def _pass_on(

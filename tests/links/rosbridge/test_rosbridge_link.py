@@ -18,10 +18,10 @@ from support.samples import moving, static
 from wsproto.events import TextMessage
 
 from tfbus import Bus, PeerLost, PeerRejected, SimulatedClock
+from tfbus._aio.websocket import WebSocket
 from tfbus.links.ros import RosOptions
 from tfbus.links.ros.messages import as_mapping
 from tfbus.links.rosbridge import RosbridgeLink
-from tfbus.links.rosbridge.websocket import WebSocket
 from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.anyio

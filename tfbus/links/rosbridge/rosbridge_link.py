@@ -33,6 +33,7 @@ from uuid import uuid4
 import anyio
 
 from tfbus._aio.task_groups import close_task_group
+from tfbus._aio.websocket import WebSocket, check_url
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.replica import ReceivedTransform
@@ -56,7 +57,6 @@ from tfbus.links.rosbridge.protocol import (
     subscribe,
     unsubscribe,
 )
-from tfbus.links.rosbridge.websocket import WebSocket, check_url
 from tfbus.links.seams import Joined, Left, Received, SendReport
 from tfbus.tf_message import Decoded, MalformedMessageError
 

@@ -1,4 +1,4 @@
-"""`WebSocket`, a client's end of a websocket that takes no message beyond a size."""
+"""`WebSocket`, one end of a websocket that takes no message beyond a size."""
 
 import ssl
 from collections.abc import Iterator
@@ -59,6 +59,8 @@ class WebSocket:
     stream : anyio.abc.ByteStream
     max_size : int
         The largest message that is received, in bytes or characters.
+    kind : ConnectionType
+        The end that this one is. `connect` and `accept` make a websocket of each kind.
 
     Attributes
     ----------
@@ -66,10 +68,12 @@ class WebSocket:
         The time of the event loop in s when the last bytes came.
     """
 
-    def __init__(self, stream: anyio.abc.ByteStream, max_size: int) -> None:
+    def __init__(
+        self, stream: anyio.abc.ByteStream, max_size: int, kind: ConnectionType = ConnectionType.CLIENT
+    ) -> None:
         self._stream = stream
         self._max_size = max_size
-        self._connection = WSConnection(ConnectionType.CLIENT)
+        self._connection = WSConnection(kind)
         self._received: Iterator[Event] = iter(())
         self._budget = TurnBudget()
         self._sending = anyio.Lock()
@@ -110,6 +114,34 @@ class WebSocket:
             if stream is not None and not opened:
                 await anyio.aclose_forcefully(stream)
 
+    @classmethod
+    async def accept(cls, stream: anyio.abc.ByteStream, head: bytes, max_size: int) -> Self:
+        """Open the server's end of a websocket, for a client that has sent the head of its request.
+
+        Parameters
+        ----------
+        stream : anyio.abc.ByteStream
+        head : bytes
+            All bytes that the client has sent so far.
+        max_size : int
+            The largest message that is received, in bytes or characters.
+
+        Raises
+        ------
+        OSError
+            If the client is gone, or asks for no websocket. The caller closes the stream.
+        """
+        socket = cls(stream, max_size, ConnectionType.SERVER)
+        try:
+            socket._take(head)
+        except Exception as error:  # noqa: BLE001 - the library raises errors of several kinds
+            raise ConnectionAbortedError(f"it asks for no websocket: {error!r}"[:200]) from None
+        request = await socket._next_event()
+        if not isinstance(request, Request):
+            raise ConnectionAbortedError("it asks for no websocket")
+        await socket._send(AcceptConnection())
+        return socket
+
     async def receive(self) -> str | bytes:
         """The next message.
 
@@ -141,9 +173,9 @@ class WebSocket:
         """Let other tasks have their turn, if what this websocket brings has kept the event loop for too long."""
         await self._budget.give_way()
 
-    async def send(self, text: str) -> None:
+    async def send(self, message: str | bytes) -> None:
         """Send a message; raises `OSError` if the other end is gone."""
-        await self._send(TextMessage(text))
+        await self._send(TextMessage(message) if isinstance(message, str) else BytesMessage(message))
 
     async def ping(self) -> None:
         """Have the other end answer, which `heard` tells; raises `OSError` if it is gone."""
@@ -168,9 +200,7 @@ class WebSocket:
                     return event
                 data = await self._stream.receive(_AT_ONCE)
                 self._budget.begin()
-                self.heard = anyio.current_time()
-                self._connection.receive_data(data)
-                self._received = self._connection.events()
+                self._take(data)
             except _GONE:
                 raise ConnectionResetError("the connection is gone") from None
             # Bytes that are no websocket also get a few other errors out of the library.
@@ -178,6 +208,11 @@ class WebSocket:
                 if isinstance(error, OSError):
                     raise
                 raise ConnectionAbortedError(f"it is no websocket: {error!r}"[:200]) from None
+
+    def _take(self, data: bytes) -> None:
+        self.heard = anyio.current_time()
+        self._connection.receive_data(data)
+        self._received = self._connection.events()
 
     async def _send(self, event: Event) -> None:
         try:
