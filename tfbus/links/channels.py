@@ -12,12 +12,7 @@ from math import inf
 from typing import Final
 
 from tfbus.links.endpoint import MAX_PEERS
-from tfbus.links.message import (
-    Kind,
-    Outgoing,
-    Way,
-    write_message,
-)
+from tfbus.links.message import Kind, Outgoing, Way, write_message
 from tfbus.links.replica import Entry, OutgoingBatch, RemovedFrame, View, hash_bytes
 from tfbus.links.seams import SendReport, Wire
 

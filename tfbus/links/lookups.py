@@ -85,14 +85,10 @@ class RemoteLookups:
         # The peers that serve a buffer, and their robots.
         self._servers: dict[str, str] = {}
         self._changed = anyio.Event()
-        self._is_open = False
+        self._is_open = True
         self.server: BufferServer | None = None
 
     # Coming in
-
-    def open(self) -> None:
-        """The link is there."""
-        self._is_open = True
 
     def close(self) -> None:
         """The link ends."""

@@ -36,6 +36,7 @@ from tfbus.errors import UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.links.message import can_hold, sendable
 from tfbus.links.replica import Entry, Known, OutgoingBatch, Provenance, ReceivedTransform, RemovedFrame, Replica, View
+from tfbus.links.seams import Host
 from tfbus.registration import Registration
 from tfbus.rows import Row
 
@@ -59,6 +60,8 @@ class Outbox:
 
     Attributes
     ----------
+    host : Host
+        Set by the link before anything is called.
     frames : frozenset of str or None
     pending : int
         How many samples and removals wait to go out.
@@ -68,6 +71,7 @@ class Outbox:
         The view of them that this link tells; None if it tells no entries.
     """
 
+    host: Host
     own: View | None = None
 
     def __init__(self, frames: Iterable[str] | None) -> None:
@@ -82,7 +86,7 @@ class Outbox:
         if entry is not None:
             self._entries.append(entry)
             self.pending += entry.size
-            self._notify()
+            self.host.send_soon(self.pending)
 
     def outgoing(self, entry: Entry) -> Entry | None:
         """The part of an entry that this link may send; None if it may send nothing of it."""
@@ -94,10 +98,6 @@ class Outbox:
 
     def reach_changed(self) -> None:
         """The buses that this one reaches by other links have changed."""
-
-    def _notify(self) -> None:
-        """Note that the outbox has something to send."""
-        raise NotImplementedError
 
 
 @dataclass(eq=False, slots=True)
