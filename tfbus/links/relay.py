@@ -379,7 +379,8 @@ class Relay:
             return
         removal = RemovedFrame(source.origin, source.sequence, frame)
         if known is None or known.source is not source:
-            self.replica.note(frame, source, None, self._route if sendable(removal, _ignore) else ())
+            # The outboxes report one that cannot be sent.
+            self.replica.note(frame, source, None, self._route if sendable(removal, lambda *_: None) else ())
         if known is not None and known.passed:
             # Copies of the last samples may come late.
             known.passed = dict.fromkeys(list(known.passed)[-_PASSED_OF_GONE:])
@@ -393,10 +394,6 @@ def relay_of(bus: Bus) -> Relay:
     if not isinstance(bus._relay, Relay):
         bus._relay = Relay(bus)
     return bus._relay
-
-
-def _ignore(reason: str, error: Exception) -> None:
-    """The outboxes report it."""
 
 
 def _source_of(sample: TransformStamped) -> Provenance | None:
