@@ -344,10 +344,7 @@ class Replica:
             If its bus, or all together, has too many frames.
         """
         known = self.entries.get(frame)
-        is_new = known is None or source.sequence > known.source.sequence or source.rank > known.source.rank
-        if not is_new and known is not None and source.rank == known.source.rank:
-            # Two samples of one batch.
-            is_new = sample is not None and known.sample is not None and sample.stamp > known.sample.stamp
+        is_new = known is None or source.sequence > known.source.sequence or self._replaces(source, sample, known)
         if is_new:
             if known is None or known.source.origin != source.origin or (known.sample is None) is not (sample is None):
                 self._admit(source.origin, known, sample, max_frames)
@@ -428,6 +425,13 @@ class Replica:
                 break
             del self._unsettled[frame]
             self._number(self.entries[frame], settled=True)
+
+    @staticmethod
+    def _replaces(source: Provenance, sample: TransformStamped | None, known: Known) -> bool:
+        if source.sequence != known.source.sequence or source.origin != known.source.origin:
+            return source.rank > known.source.rank
+        # Two samples of one batch.
+        return sample is not None and known.sample is not None and sample.stamp > known.sample.stamp
 
     def _admit(self, origin: bytes, known: Known | None, sample: TransformStamped | None, max_frames: float) -> None:
         """Count a new entry in place of a known one."""
