@@ -37,7 +37,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "data": ("geometry",),
     "earth": ("data",),
     "tf_message": ("geometry",),
-    "tree": ("data",),
+    "uncertainty": ("data",),
+    "tree": ("uncertainty",),
     "waiting": ("tree",),
     "bus": ("waiting",),
     "buffer": ("bus",),
@@ -69,7 +70,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "__main__": ("cli",),
 }
 
-_PLAIN_ROOMS = {"analysis", "axes", "data", "earth", "geometry", "tf_message", "tree", "waiting"}
+_PLAIN_ROOMS = {"analysis", "axes", "data", "earth", "geometry", "tf_message", "tree", "uncertainty", "waiting"}
 SANS_IO = {*GROUND, *_PLAIN_ROOMS} - {"clock", "_aio"}
 EFFECTS = {"anyio", "asyncio", "sniffio", "socket", "threading", "time", "trio"}
 # The judge of a bus notices by itself that its comparison with the clock has grown old.

@@ -34,6 +34,7 @@ from tfbus.data import Odometry as Odometry
 from tfbus.data import Path as Path
 from tfbus.data import PointCloud as PointCloud
 from tfbus.data import PointStamped as PointStamped
+from tfbus.data import PointWithCovarianceStamped as PointWithCovarianceStamped
 from tfbus.data import Polygon as Polygon
 from tfbus.data import PoseArray as PoseArray
 from tfbus.data import PoseStamped as PoseStamped
@@ -84,9 +85,11 @@ from tfbus.events import SampleRejected as SampleRejected
 from tfbus.events import StampAhead as StampAhead
 from tfbus.events import StampBehind as StampBehind
 from tfbus.events import SubscriberFailed as SubscriberFailed
+from tfbus.geometry.covariance import Covariance as Covariance
 from tfbus.geometry.stamped import TransformStamped as TransformStamped
 from tfbus.geometry.transform import Transform as Transform
 from tfbus.geometry.transform_array import TransformArray as TransformArray
+from tfbus.geometry.uncertain import UncertainSample as UncertainSample
 from tfbus.links.local.local_link import LocalLink as LocalLink
 from tfbus.message_filter.message_filter import MessageFilter as MessageFilter
 from tfbus.recording.static_frames import load_static as load_static
@@ -119,6 +122,11 @@ from tfbus.tree.history import Outcome as Outcome
 from tfbus.tree.lookup import Hold as Hold
 from tfbus.tree.lookup import Question as Question
 from tfbus.tree.tree import TransformTree as TransformTree
+from tfbus.uncertainty import JointAnswers as JointAnswers
+from tfbus.uncertainty import Share as Share
+from tfbus.uncertainty import UncertainTransform as UncertainTransform
+from tfbus.uncertainty import UncertainTransformArray as UncertainTransformArray
+from tfbus.uncertainty import joint as joint
 from tfbus.waiting.live_tree import PendingLookup as PendingLookup
 from tfbus.which_kernel import kernel as kernel
 

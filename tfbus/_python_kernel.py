@@ -32,6 +32,8 @@ class Sample:
     # One slot, because the hot paths read all six fields at once.
     __slots__ = ("_fields",)
     _fields: tuple[str, str, int, Row, str, bool]
+    _is_plain = True
+    """Whether it knows nothing beyond its fields. The kernel hands other samples back."""
 
     @property
     def parent(self) -> str:
@@ -821,7 +823,9 @@ class Paths:
             return False
         parent, child, stamp, row, authority, static = batch[0]._fields
         with self._lock:
-            if readers or static or child not in frames or not frames[child].append(parent, stamp, row, authority):
+            if readers or static or child not in frames or not batch[0]._is_plain:
+                return False
+            if not frames[child].append(parent, stamp, row, authority):
                 return False
             self.inserted += 1
         return True
@@ -883,6 +887,8 @@ def commit(frames: Mapping[str, History], batch: Sequence[Sample], first: int) -
     """
     for i in range(first, len(batch)):
         parent, child, stamp, row, authority, static = batch[i]._fields
-        if static or child not in frames or not frames[child].append(parent, stamp, row, authority):
+        if static or child not in frames or not batch[i]._is_plain:
+            return i
+        if not frames[child].append(parent, stamp, row, authority):
             return i
     return len(batch)

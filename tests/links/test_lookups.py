@@ -407,7 +407,7 @@ async def test_an_error_of_the_buffer_that_no_lookup_raises_fails_the_question_o
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     class Broken(Buffer):
-        def lookup_nowait(self, *arguments: Any, **options: Any) -> TransformStamped:
+        def lookup_nowait(self, *arguments: Any, **options: Any) -> Any:
             if options["target"] == "map":
                 raise ZeroDivisionError("a bug")
             return super().lookup_nowait(*arguments, **options)

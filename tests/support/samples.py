@@ -48,7 +48,8 @@ def tree_of(*batch: TransformStamped, keep: float | None = 10.0) -> TransformTre
 
 def x_of(tree: TransformTree, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> float:
     """The x of a lookup, in m."""
-    return tree.lookup(target, source, at, **question).transform.translation[0]
+    found: TransformStamped = tree.lookup(target, source, at, **question)
+    return found.transform.translation[0]
 
 
 def newest_samples(stored: Iterable[TransformStamped]) -> dict[str, TransformStamped]:

@@ -739,7 +739,7 @@ paths_init(Paths *self, PyObject *args, PyObject *kwargs)
     Py_INCREF(latest);
     self->latest = latest;
     Py_INCREF(kind);
-    self->kind = kind;
+    self->kind = plain_kind = kind;
     return 0;
 }
 

@@ -197,6 +197,16 @@ batch_size(PyObject *batch)
     return PyTuple_CheckExact(batch) ? PyTuple_Size(batch) : ((Columns *)batch)->count;
 }
 
+/* The class of the samples that know nothing beyond their fields; NULL until the first Paths. Borrowed, and only
+ * compared. Python stores every other sample, because it notes what the sample knows more, such as a covariance. */
+static PyObject *plain_kind;
+
+static int
+knows_more(const Sample *sample)
+{
+    return plain_kind != NULL && OBJECT(Py_TYPE(OBJECT(sample))) != plain_kind;
+}
+
 static int
 is_batch(PyObject *value)
 {
@@ -1355,7 +1365,7 @@ store(PyObject *frames, PyObject *batch, Py_ssize_t first, int whole)
     while (first + stored < size) {
         Sample scratch;
         const Sample *sample = sample_at(batch, first + stored, &scratch);
-        if (sample == NULL || sample->is_static) {
+        if (sample == NULL || sample->is_static || (sample != &scratch && knows_more(sample))) {
             break;
         }
         if (sample->child != child) {

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from types import TracebackType
-from typing import Any, SupportsIndex, TypeVar
+from typing import Any, Literal, SupportsIndex, TypedDict, TypeVar, Unpack, cast, overload
 
 from tfbus._aio.loops import checkpoint
 from tfbus.buffer.lookups import LocalNames, Lookups
@@ -22,14 +22,36 @@ from tfbus.tf2_names import says_ours
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
-from tfbus.tree.lookup import Hold, Question, answer, policy_of, question_of
+from tfbus.tree.lookup import Hold, Options, Question, answer, policy_of, question_of
 from tfbus.tree.lookup_many import deskew, deskew_stamps
 from tfbus.tree.rendering import cell, counted, describe, to_html
 from tfbus.tree.tree import TransformTree, forest_of, tree_of, window_of
+from tfbus.tree.uncertain import uncertain_answer
+from tfbus.uncertainty import UncertainTransform
+from tfbus.uncertainty.data import with_error_of
 from tfbus.waiting.live_tree import LiveTree, PendingLookup
 from tfbus.which_kernel import plain_first
 
 DataT = TypeVar("DataT", bound=Stamped)
+
+
+class _Options(Options, total=False):
+    max_age: float | None
+
+
+class _WaitOptions(_Options, total=False):
+    timeout: float | None
+
+
+class _TransformOptions(TypedDict, total=False):
+    timeout: float | None
+    max_age: float | None
+    at: AtLike | None
+    fixed: str | None
+    tolerance: float
+    max_gap: float | None
+    extrapolate: Hold | None
+
 
 _DESCRIBED = 10
 """The number of waiting lookups that `describe` shows; each may have to search all frames for similar names."""
@@ -138,6 +160,16 @@ class Buffer:
         """The tree behind this buffer. It can only be read: its samples come from the bus."""
         return self._tree
 
+    @overload
+    def lookup_nowait(
+        self, target: str, source: str, at: AtLike = ..., *, covariance: Literal[True], **options: Unpack[_Options]
+    ) -> UncertainTransform: ...
+
+    @overload
+    def lookup_nowait(
+        self, target: str, source: str, at: AtLike = ..., *, covariance: bool = ..., **options: Unpack[_Options]
+    ) -> TransformStamped: ...
+
     @plain_first
     def lookup_nowait(
         self,
@@ -151,6 +183,7 @@ class Buffer:
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
+        covariance: bool = False,
     ) -> TransformStamped:
         """The transform from `source` to `target`, or an error at once. See `TransformTree.lookup`.
 
@@ -162,7 +195,7 @@ class Buffer:
         max_age : float, optional
             Count a `LATEST` answer older than this many s as not yet arrived, and refuse an answer that is further than
             this ahead of the clock.
-        source_at, fixed, tolerance, max_gap, extrapolate
+        source_at, fixed, tolerance, max_gap, extrapolate, covariance
             As `TransformTree.lookup`.
 
         Raises
@@ -182,12 +215,13 @@ class Buffer:
         bounds = None if max_age is None else self._lookups.bounds(max_age, as_at(at), as_at(source_at))
         names = self._local_names
         policy = policy_of(tolerance, max_gap, extrapolate)
+        ask: Callable[..., TransformStamped] = uncertain_answer if covariance else answer
         try:
             if names is None:
-                return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
+                return ask(self._forest, target, source, at, source_at, fixed, bounds, policy)
             via = None if fixed is None else names.on_bus(fixed)
             above, below = names.on_bus(target), names.on_bus(source)
-            found = answer(self._forest, above, below, at, source_at, via, bounds, policy)
+            found = ask(self._forest, above, below, at, source_at, via, bounds, policy)
             # The next such lookup is as plain as one without a prefix.
             self._forest.keep_locally(self._paths, (target, source), above, below)
         except TransformLookupError as error:
@@ -195,6 +229,16 @@ class Buffer:
             raise
         # Not `names.answer`, which costs a fifth of this lookup: the local names are at hand.
         return renamed(found, target, source)
+
+    @overload
+    async def lookup(
+        self, target: str, source: str, at: AtLike = ..., *, covariance: Literal[True], **options: Unpack[_WaitOptions]
+    ) -> UncertainTransform: ...
+
+    @overload
+    async def lookup(
+        self, target: str, source: str, at: AtLike = ..., *, covariance: bool = ..., **options: Unpack[_WaitOptions]
+    ) -> TransformStamped: ...
 
     async def lookup(
         self,
@@ -209,6 +253,7 @@ class Buffer:
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
+        covariance: bool = False,
     ) -> TransformStamped:
         """The transform from `source` to `target`, as soon as it is known.
 
@@ -232,6 +277,8 @@ class Buffer:
             The frame that stands still between the two stamps.
         tolerance, max_gap, extrapolate
             As `TransformTree.lookup`. The wait ends at the first moment at which they allow an answer.
+        covariance : bool
+            As `TransformTree.lookup`.
 
         Returns
         -------
@@ -266,6 +313,11 @@ class Buffer:
         ...     print((await buffer.lookup("map", "cart", clock.now(), timeout=1.0)).transform.translation)
         (1.0, 2.0, 0.0)
         """
+        if covariance:
+            question = Question(
+                target, source, as_at(at), as_at(source_at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate)
+            )
+            return await self._uncertain(self._on_bus(question), timeout)
         waits_plainly = max_age is None and source_at is None and fixed is None and not tolerance
         if self._feed is None or not waits_plainly or max_gap is not None or extrapolate is not None:
             policy = policy_of(tolerance, max_gap, extrapolate)
@@ -292,9 +344,19 @@ class Buffer:
             wait.cancel_end()
         return found
 
+    @overload
+    async def transform(
+        self, data: Stamped, target: str, *, covariance: Literal[True], **options: Unpack[_TransformOptions]
+    ) -> Any: ...
+
+    @overload
+    async def transform(
+        self, data: DataT, target: str, *, covariance: Literal[False] = ..., **options: Unpack[_TransformOptions]
+    ) -> DataT: ...
+
     async def transform(
         self,
-        data: DataT,
+        data: Any,
         target: str,
         *,
         timeout: float | None = None,
@@ -304,7 +366,8 @@ class Buffer:
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
-    ) -> DataT:
+        covariance: bool = False,
+    ) -> Any:
         """`data` in the frame `target`, by the transform at their own stamp, as soon as it is known.
 
         Parameters
@@ -322,11 +385,16 @@ class Buffer:
         tolerance, max_gap, extrapolate
             As `lookup`. The result does not say whether samples were held or extrapolated; if that matters, look the
             transform up.
+        covariance : bool
+            Whether the error of the transform is added to the data's own: for an `Odometry`, a
+            `PoseWithCovarianceStamped` or a `PointWithCovarianceStamped`, or a `PoseStamped` or `PointStamped`, which
+            becomes one.
 
         Returns
         -------
         same type as `data`
-            Its frame is `target`, and its stamp is the stamp of the transform.
+            Its frame is `target`, and its stamp is the stamp of the transform. With `covariance`, a pose or a point
+            without one comes back with one.
 
         Raises
         ------
@@ -348,7 +416,15 @@ class Buffer:
         if self._is_in_place(question):
             await checkpoint()
             return data
+        if covariance:
+            return with_error_of(data, await self._uncertain(self._on_bus(question), timeout))
         return do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
+
+    async def _uncertain(self, question: Question, timeout: float | None) -> UncertainTransform:
+        """The answer to a question in the names of the bus, with its error, as soon as it is known."""
+        await self._lookups.lookup(question, timeout)
+        # Nothing is awaited from here on: the edges are read as they are now.
+        return cast(UncertainTransform, self._lookups.lookup_nowait(question, uncertain_answer))
 
     async def deskew(
         self,

@@ -450,17 +450,17 @@ class Lookups:
         if error.newest is not None and self._clock.now() < error.newest > self.bus._newest_plausible():
             error.ahead = error.newest - self._clock.now()
 
-    def lookup_nowait(self, question: Question) -> TransformStamped:
-        """The answer, or an error at once."""
+    def lookup_nowait(self, question: Question, ask: Callable[..., TransformStamped] = answer) -> TransformStamped:
+        """The answer, or an error at once. `ask` may be another function with the arguments of `answer`."""
         bounds = None
-        if question.is_plain:
+        if question.is_plain and ask is answer:
             plain = self.forest.paths.answer(question.target, question.source, question.at)
             if plain is not None:
                 return plain if self._local_names is None else self._local_names.answer(plain)
         if question.max_age is not None:
             bounds = self.bounds(question.max_age, question.at, question.source_at)
         try:
-            found = answer(
+            found = ask(
                 self.forest,
                 question.target,
                 question.source,

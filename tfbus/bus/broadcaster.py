@@ -13,8 +13,10 @@ from tfbus.bus.topology import Invalid, as_invalid
 from tfbus.errors import BusClosedError, UnknownFrameError
 from tfbus.frames import as_prefix
 from tfbus.geometry.columns import Names
+from tfbus.geometry.covariance import Covariance, Kind, as_covariance, as_kind
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
+from tfbus.geometry.uncertain import Belief, with_belief
 from tfbus.stamps import StampLike, StampsLike, as_stamp, from_seconds
 from tfbus.tf2_names import says_ours
 
@@ -91,7 +93,16 @@ class TransformBroadcaster:
         self._prefix = as_prefix(prefix, shared)
         self._invalid = as_invalid(invalid)
 
-    def send(self, parent: str, child: str, transform: Transform, at: StampLike | None = None) -> None:
+    def send(
+        self,
+        parent: str,
+        child: str,
+        transform: Transform,
+        at: StampLike | None = None,
+        *,
+        covariance: Covariance | None = None,
+        kind: Kind = "independent",
+    ) -> None:
         """Publish where `child` is, seen from `parent`.
 
         Parameters
@@ -101,11 +112,17 @@ class TransformBroadcaster:
             Maps `child` coordinates into `parent`.
         at : int, optional
             ns; by default the clock's now.
+        covariance : Covariance, optional
+            The size of the sample's error. Lookups with ``covariance=True`` use it.
+        kind : {"independent", "drift", "constant"}
+            The relation of the errors of this edge at two stamps, as `UncertainSample` says.
 
         Raises
         ------
         InvalidTransformError
             If a name or the stamp is bad, or the bus refuses the sample, as `Bus.publish` says. Nothing is stored.
+        ValueError
+            If the kind is another.
         BusClosedError, TypeError
 
         Examples
@@ -119,7 +136,10 @@ class TransformBroadcaster:
         """
         if self._prefix is not None:
             parent, child = self._on_bus(parent), self._on_bus(child)
-        self._to.publish(TransformStamped(parent, child, self._stamp(at), transform, self.authority), self._invalid)
+        sample = TransformStamped(parent, child, self._stamp(at), transform, self.authority)
+        if covariance is not None:
+            sample = with_belief(sample, Belief(as_covariance(covariance), as_kind(kind)))
+        self._to.publish(sample, self._invalid)
 
     def send_all(
         self, samples: Iterable[TransformStamped | tuple[str, str, Transform]], at: StampLike | None = None
@@ -229,8 +249,12 @@ class TransformBroadcaster:
         stamps = self.bus.clock.now() if at is None else at
         self._to.publish_columns(above, below, stamps, translations, rotations, self.authority, invalid=self._invalid)
 
-    def send_static(self, parent: str, child: str, transform: Transform) -> None:
+    def send_static(
+        self, parent: str, child: str, transform: Transform, *, covariance: Covariance | None = None
+    ) -> None:
         """Publish a transform that holds at every stamp. Later subscribers get it too; sending it again replaces it.
+
+        A `covariance` is that of one constant error.
 
         Raises
         ------
@@ -247,6 +271,8 @@ class TransformBroadcaster:
         """
         parent, child = self._on_bus(parent), self._on_bus(child)
         sample = TransformStamped(parent, child, self.bus.clock.now(), transform, self.authority, static=True)
+        if covariance is not None:
+            sample = with_belief(sample, Belief(as_covariance(covariance), "constant"))
         self._to.publish(sample, self._invalid)
 
     async def correct(

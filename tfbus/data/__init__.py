@@ -18,7 +18,13 @@ from tfbus.data.motion import (
 from tfbus.data.paths import Path, PoseArray
 from tfbus.data.points import NavSatFix, PointStamped, Polygon, PoseStamped, QuaternionStamped, Vector3Stamped
 from tfbus.data.scans import LaserScan
-from tfbus.data.spatial import PoseWithCovarianceStamped, TwistArray, TwistStamped, WrenchStamped
+from tfbus.data.spatial import (
+    PointWithCovarianceStamped,
+    PoseWithCovarianceStamped,
+    TwistArray,
+    TwistStamped,
+    WrenchStamped,
+)
 
 __all__ = [
     "AccelStamped",
@@ -30,6 +36,7 @@ __all__ = [
     "Path",
     "PointCloud",
     "PointStamped",
+    "PointWithCovarianceStamped",
     "Polygon",
     "PoseArray",
     "PoseStamped",

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from tfbus.data.dispatch import (
     CopiedByFields,
     as_covariance,
+    as_triple,
     check_header,
     check_pose,
     construct,
@@ -65,6 +66,44 @@ class PoseWithCovarianceStamped(CopiedByFields, PlainData):
         check_header(self)
         check_pose(self.pose)
         object.__setattr__(self, "covariance", as_covariance(self.covariance, "covariance", 6))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointWithCovarianceStamped(CopiedByFields, PlainData):
+    """A position and its covariance, as a buffer gives it with ``covariance=True``. Equal only to itself.
+
+    Parameters
+    ----------
+    frame : str
+    stamp : int or LATEST
+        ns.
+    point : sequence of 3 floats
+        (x, y, z) in m.
+    covariance : array of shape (3, 3), or 9 numbers row by row
+        In m^2, along the axes of `frame`. Copied.
+
+    Notes
+    -----
+    A transform turns the covariance, S -> R S R^T. ROS has no such message.
+
+    Examples
+    --------
+    >>> PointWithCovarianceStamped("laser", 0, (1.0, 2.0, 3.0), np.eye(3)).covariance.shape
+    (3, 3)
+    """
+
+    frame: str
+    stamp: int | Latest
+    point: Vector
+    covariance: npt.NDArray[np.float64]
+
+    def __init__(self, frame: str, stamp: AtLike, point: Numbers, covariance: npt.ArrayLike) -> None:
+        construct(self, frame, stamp, point, covariance)
+
+    def __post_init__(self) -> None:
+        check_header(self)
+        object.__setattr__(self, "point", as_triple(self.point, "point"))
+        object.__setattr__(self, "covariance", as_covariance(self.covariance, "covariance", 3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +226,12 @@ def _(data: PoseWithCovarianceStamped, transform: TransformStamped) -> PoseWithC
     header = moved_header(data, transform)
     covariance = rotated(data.covariance, transform.transform)
     return PoseWithCovarianceStamped(*header, transform.transform @ data.pose, covariance)
+
+
+@do_transform.register
+def _(data: PointWithCovarianceStamped, transform: TransformStamped) -> PointWithCovarianceStamped:
+    header, point = moved_header(data, transform), transform.transform.apply(data.point)
+    return PointWithCovarianceStamped(*header, point, rotated(data.covariance, transform.transform))
 
 
 @do_transform.register

@@ -159,6 +159,9 @@ class TransformStamped(Sample):
 
     __replace__ = replace
 
+    def _take(self, other: Any) -> None:
+        """Take over what a subclass knows beyond the fields."""
+
     def to_dict(self, *, stamps: StampsAs = "int") -> dict[str, Any]:
         """Plain data for JSON: ``"type"``, and the parameters under their names; the stamp is an ``int`` of ns.
 
@@ -293,6 +296,9 @@ class QualifiedTransform(TransformStamped):
         """The time in ns between two samples that were interpolated, on the edge where it is longest."""
         return self._policy_use[1]
 
+    def _take(self, other: Any) -> None:
+        self._policy_use = other._policy_use
+
     def to_dict(self, *, stamps: StampsAs = "int") -> dict[str, Any]:
         """As `TransformStamped.to_dict`, with ``"extrapolated_by"`` and ``"gap"`` in ns."""
         return {**super().to_dict(stamps=stamps), "extrapolated_by": self.extrapolated_by, "gap": self.gap}
@@ -326,8 +332,8 @@ def renamed(answer: TransformStamped, target: str, source: str) -> TransformStam
     """An answer with other names for its two frames."""
     copy = type(answer).__new__(type(answer))
     copy._fields = target, source, *answer._fields[2:]
-    if isinstance(answer, QualifiedTransform) and isinstance(copy, QualifiedTransform):
-        copy._policy_use = answer._policy_use
+    if type(answer) is not TransformStamped:
+        copy._take(answer)
     return copy
 
 

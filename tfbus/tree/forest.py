@@ -496,6 +496,7 @@ class StaticFrames:
         history.static_stamp = stamp
         history.static_row = row
         history.authority = authority
+        history.note(sample)
         history.shared = True
         self.names.update(child, (parent,))
 
@@ -697,6 +698,9 @@ class Forest:
         else:
             self.expired += 1
             self.expired_samples.append(sample)
+            return outcome
+        if type(sample) is not TransformStamped or history.beliefs is not None:
+            history.note(sample)
         return outcome
 
     def remove(self, frame: str) -> None:

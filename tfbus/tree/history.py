@@ -26,6 +26,7 @@ from tfbus.errors import (
 )
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import from_row
+from tfbus.geometry.uncertain import Belief, UncertainSample, with_belief
 from tfbus.rows import IDENTITY, Row, interpolate
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest, Stamps
 from tfbus.which_kernel import History
@@ -103,6 +104,9 @@ class Runs(list[tuple[int, str]]):
 
 
 NO_RUNS: Final = Runs()
+
+_FEW = 64
+"""Up to this many covariances are kept although their samples may have left the window."""
 
 _BLOCK = 64
 """Up to this many samples for each stamp, copying all samples is faster than picking some."""
@@ -229,9 +233,12 @@ class FrameHistory(History):
         clears it.
     shared : bool
         Whether several forests hold this static history. They only read it, and insert into a copy of their own.
+    beliefs : dict of int to Belief, or None
+        The covariances of samples by their stamps; None if there never was one. A stamp that has left the window may
+        still be in it.
     """
 
-    __slots__ = ("_authorities", "_parents", "changed", "child", "shared", "static", "static_row")
+    __slots__ = ("_authorities", "_parents", "beliefs", "changed", "child", "shared", "static", "static_row")
 
     def __init__(self, child: str, parent: str, static: bool, keep: int | None) -> None:
         super().__init__(parent, keep)
@@ -240,6 +247,7 @@ class FrameHistory(History):
         self.static_row: Row = IDENTITY
         self.changed: bool = False
         self.shared: bool = False
+        self.beliefs: dict[int, Belief] | None = None
         self._parents = NO_RUNS
         self._authorities = NO_RUNS
 
@@ -274,6 +282,7 @@ class FrameHistory(History):
         if self.static:
             self.static = False
             self.static_stamp = None
+            self.beliefs = None
             self.changed = True
         if newest is not None:
             self._parents = self._parents.push(stamp, parent, self.parent)
@@ -299,9 +308,22 @@ class FrameHistory(History):
         self.static_row = row
         return Outcome.INSERTED if fresh else Outcome.REPLACED
 
+    def note(self, sample: TransformStamped) -> None:
+        """Note the covariance of a sample that was stored, or that the one at its stamp has none any more."""
+        if isinstance(sample, UncertainSample):
+            if self.beliefs is None or self.static:
+                self.beliefs = {}
+            elif len(self.beliefs) > 2 * self.count + _FEW and self.oldest is not None:
+                oldest = self.oldest
+                self.beliefs = {stamp: belief for stamp, belief in self.beliefs.items() if stamp >= oldest}
+            self.beliefs[sample.stamp] = sample.belief
+        elif self.beliefs is not None:
+            self.beliefs.pop(sample.stamp, None)
+
     def clear(self) -> None:
         """Drop all moving samples; the newest parent is remembered."""
         super().clear()
+        self.beliefs = None
         self._parents = self._authorities = NO_RUNS
         if self.mixed:
             self.mixed: bool = False
@@ -423,6 +445,7 @@ class FrameHistory(History):
         twin._parents = self._parents.copy()
         twin._authorities = self._authorities.copy()
         twin.mixed = self.mixed
+        twin.beliefs = None if self.beliefs is None else self.beliefs.copy()
         return twin
 
     def copy_within(self, keep: int | None) -> "FrameHistory":
@@ -473,7 +496,11 @@ def clear_samples(histories: Collection[FrameHistory]) -> list[FrameHistory]:
     calling a method in Python.
     """
     deque(map(History.clear, histories), maxlen=0)
-    return [history for history in histories if history.mixed or history._authorities]
+    return [
+        history
+        for history in histories
+        if history.mixed or history._authorities or (history.beliefs is not None and not history.static)
+    ]
 
 
 STALE_AFTER = 1.0
@@ -521,6 +548,8 @@ class SavedFrame(NamedTuple):
     """Translation (m) and quaternion (x, y, z, w) of each sample; shape (n, 7)."""
     runs: list[tuple[str, str, int]]
     """Parent, authority and length of each run of samples that share both."""
+    beliefs: dict[int, Belief] | None = None
+    """The covariances of samples by their stamps."""
 
 
 def save_frame(history: FrameHistory, oldest: int = STAMP_MIN) -> SavedFrame:
@@ -531,7 +560,10 @@ def save_frame(history: FrameHistory, oldest: int = STAMP_MIN) -> SavedFrame:
     static = None
     if history.static and history.static_stamp is not None:
         static = history.static_stamp, history.static_row
-    return SavedFrame(history.child, history.parent, history.authority, static, stamps[first:], rows[first:], runs)
+    beliefs = None if history.beliefs is None else history.beliefs.copy()
+    return SavedFrame(
+        history.child, history.parent, history.authority, static, stamps[first:], rows[first:], runs, beliefs
+    )
 
 
 def load_frame(saved: SavedFrame, window: int | None) -> FrameHistory:
@@ -553,20 +585,24 @@ def load_frame(saved: SavedFrame, window: int | None) -> FrameHistory:
                 history.insert(parent, int(saved.stamps[at]), _row(saved.rows[at]), authority)
         first = end
     history.changed = False
+    history.beliefs = saved.beliefs
     return history
 
 
 def samples_of(history: FrameHistory, low: int, high: int) -> Iterator[TransformStamped]:
     """The moving samples from stamp `low` to `high`, and the next one on either side; or the static one."""
+    beliefs = history.beliefs or {}
     if history.static:
         stamp = history.static_stamp or 0
-        yield TransformStamped(
+        sample = TransformStamped(
             history.parent, history.child, stamp, from_row(history.static_row), history.authority, static=True
         )
+        yield with_belief(sample, beliefs[stamp]) if stamp in beliefs else sample
         return
     stamps, rows, origins = _columns(history, low, high)
     for stamp, row, (parent, authority) in zip(stamps.tolist(), rows, origins, strict=True):
-        yield TransformStamped(parent, history.child, stamp, from_row(_row(row)), authority)
+        sample = TransformStamped(parent, history.child, stamp, from_row(_row(row)), authority)
+        yield with_belief(sample, beliefs[stamp]) if stamp in beliefs else sample
 
 
 def _columns(

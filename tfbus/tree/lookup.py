@@ -7,7 +7,7 @@ extrapolates nothing, and interpolates between any two samples, however far apar
 import math
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 
@@ -158,6 +158,16 @@ def question_of(
     if at is None or fixed is None:
         raise TypeError("at and fixed go together: the data at their stamp, carried to `at` through the fixed frame")
     return Question(target, data.frame, at, data.stamp, fixed, max_age, policy)
+
+
+class Options(TypedDict, total=False):
+    """The arguments that all lookups at one stamp share, for type checkers."""
+
+    source_at: AtLike | None
+    fixed: str | None
+    tolerance: float
+    max_gap: float | None
+    extrapolate: Hold | None
 
 
 class ReadStamp(NamedTuple):

@@ -6,9 +6,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, cast
+from typing import Any, Literal, TypedDict, Unpack, cast, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -44,11 +44,28 @@ from tfbus.tf2_names import says_ours
 from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge, FrameHistory, Outcome, SavedFrame, samples_of, save_frame
-from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, Hold, answer, bounds_of, policy_of
+from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, Hold, Options, answer, bounds_of, policy_of
 from tfbus.tree.lookup_many import OutOfRange, deskew, lookup_many
 from tfbus.tree.rendering import cell, counted, describe, to_dot, to_html, to_yaml
 from tfbus.tree.twist import twist, twist_many
+from tfbus.tree.uncertain import uncertain_answer, uncertain_many
+from tfbus.uncertainty.answers import UncertainTransform, UncertainTransformArray
 from tfbus.which_kernel import plain_first
+
+
+class _Options(Options, total=False):
+    not_before: StampLike | None
+    not_after: StampLike | None
+
+
+class _ManyOptions(TypedDict, total=False):
+    source_at: StampLike | StampsLike | None
+    fixed: str | None
+    out_of_range: OutOfRange
+    tolerance: float
+    max_gap: float | None
+    extrapolate: Hold | None
+
 
 _LONGEST_WINDOW = 100_000_000
 """The longest `keep` in s, about three years; a greater number was meant as nanoseconds."""
@@ -237,6 +254,16 @@ class TransformTree:
 
     # Questions about transforms
 
+    @overload
+    def lookup(
+        self, target: str, source: str, at: AtLike = ..., *, covariance: Literal[True], **options: Unpack[_Options]
+    ) -> UncertainTransform: ...
+
+    @overload
+    def lookup(
+        self, target: str, source: str, at: AtLike = ..., *, covariance: bool = ..., **options: Unpack[_Options]
+    ) -> TransformStamped: ...
+
     @plain_first
     def lookup(
         self,
@@ -251,6 +278,7 @@ class TransformTree:
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
+        covariance: bool = False,
     ) -> TransformStamped:
         """The transform from `source` to `target`: it maps the coordinates of source into target.
 
@@ -276,6 +304,9 @@ class TransformTree:
         extrapolate : Hold, optional
             If an edge has no sample after the stamp, or `max_gap` forbids to interpolate to it, the sample before the
             stamp stands in for some time.
+        covariance : bool
+            Whether the answer is an `UncertainTransform`, which knows the covariance of its error by those that the
+            senders gave. A sample that stands in counts with its own error.
 
         Returns
         -------
@@ -317,7 +348,8 @@ class TransformTree:
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         bounds = bounds_of(not_before, not_after)
-        return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
+        ask: Callable[..., TransformStamped] = uncertain_answer if covariance else answer
+        return ask(self._forest, target, source, at, source_at, fixed, bounds, policy)
 
     def can_transform(
         self,
@@ -411,6 +443,22 @@ class TransformTree:
             at = as_stamp(at)
         return explain(self._forest, target, source, at, bounds, policy, now)
 
+    @overload
+    def lookup_many(
+        self,
+        target: str,
+        source: str,
+        stamps: StampsLike,
+        *,
+        covariance: Literal[True],
+        **options: Unpack[_ManyOptions],
+    ) -> UncertainTransformArray: ...
+
+    @overload
+    def lookup_many(
+        self, target: str, source: str, stamps: StampsLike, *, covariance: bool = ..., **options: Unpack[_ManyOptions]
+    ) -> TransformArray: ...
+
     @partial(plain_first, many=TransformArray)
     def lookup_many(
         self,
@@ -424,6 +472,7 @@ class TransformTree:
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
+        covariance: bool = False,
     ) -> TransformArray:
         """The transforms from `source` to `target` at many stamps.
 
@@ -440,6 +489,8 @@ class TransformTree:
             Stamps without an answer raise an error that names the first, or give NaN.
         tolerance, max_gap, extrapolate
             As `lookup`.
+        covariance : bool
+            Whether the answer is an `UncertainTransformArray`, which has a covariance for each transform.
 
         Returns
         -------
@@ -474,8 +525,8 @@ class TransformTree:
             raise TypeError(GO_TOGETHER)
         source_stamps = None if source_at is None else _as_many(source_at, len(asked))
         policy = policy_of(tolerance, max_gap, extrapolate)
-        found = lookup_many(self._forest, target, source, asked, source_stamps, fixed, out_of_range, policy)
-        return with_stamps(found, asked)
+        ask: Callable[..., TransformArray] = uncertain_many if covariance else lookup_many
+        return with_stamps(ask(self._forest, target, source, asked, source_stamps, fixed, out_of_range, policy), asked)
 
     def deskew(
         self,

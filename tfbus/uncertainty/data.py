@@ -1,0 +1,68 @@
+"""Poses and points in another frame, with their own error and that of the transform."""
+
+from typing import Any
+
+import numpy as np
+
+from tfbus.data import (
+    Odometry,
+    PointStamped,
+    PointWithCovarianceStamped,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    do_transform,
+)
+from tfbus.geometry.covariance import Matrix, lever_arm
+from tfbus.uncertainty.answers import UncertainTransform
+
+
+def with_error_of(data: Any, transform: UncertainTransform) -> Any:
+    """`data` in the transform's target, with the sum of their own covariance and the transform's at their place.
+
+    The two are taken as independent. Data without a covariance count as exact; a covariance that is unknown, because a
+    variance in it is negative, stays unknown.
+
+    Raises
+    ------
+    TypeError
+        If the data are neither a pose nor a point.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> _ = tree.insert(UncertainSample("map", "base", 0, Transform(), covariance=Covariance.of(rpy=0.1)))
+    >>> found = with_error_of(PointStamped("base", 0, (2.0, 0.0, 0.0)), tree.lookup("map", "base", covariance=True))
+    >>> found.covariance.diagonal().round(9).tolist()
+    [0.0, 0.04, 0.04]
+    """
+    moved: Any = do_transform(data, transform)
+    turn = transform.transform.matrix()[:3, :3]
+    if isinstance(data, (PointStamped, PointWithCovarianceStamped)):
+        jacobian: Matrix = lever_arm(turn @ data.point)[:3]
+        error = jacobian @ transform.covariance.matrix @ jacobian.T
+        return PointWithCovarianceStamped(moved.frame, moved.stamp, moved.point, _added(moved, "covariance", error))
+    if isinstance(data, (PoseStamped, PoseWithCovarianceStamped, Odometry)):
+        jacobian = lever_arm(turn @ data.pose.translation)
+        error = jacobian @ transform.covariance.matrix @ jacobian.T
+        if isinstance(moved, Odometry):
+            return Odometry(
+                moved.frame,
+                moved.stamp,
+                moved.child,
+                moved.pose,
+                moved.linear,
+                moved.angular,
+                pose_covariance=_added(moved, "pose_covariance", error),
+                twist_covariance=moved.twist_covariance,
+            )
+        return PoseWithCovarianceStamped(moved.frame, moved.stamp, moved.pose, _added(moved, "covariance", error))
+    raise TypeError(
+        f"a {type(data).__name__} has no place for a covariance: look the transform up with covariance=True instead"
+    )
+
+
+def _added(moved: Any, name: str, error: Matrix) -> Matrix:
+    own = getattr(moved, name, None)
+    if own is None:
+        return error
+    return own if (own.diagonal() < 0.0).any() else np.asarray(own + error)
