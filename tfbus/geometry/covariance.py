@@ -329,7 +329,8 @@ def as_kind(kind: Kind) -> Kind:
 def _is_positive(matrix: Matrix) -> bool:
     # Each variable in its own unit, so that mm beside rad are not taken for rounding.
     unit = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
-    unit[unit == 0.0] = unit.max() or 1.0
+    for half in (unit[:3], unit[3:]):
+        half[half == 0.0] = half.max() or 1.0
     try:
         np.linalg.cholesky(matrix / np.outer(unit, unit) + _ROUNDING * np.eye(6))
     except np.linalg.LinAlgError:

@@ -89,7 +89,8 @@ class UncertainTransform(TransformStamped):
     >>> tree = TransformTree()
     >>> error = Covariance.of(xyz=0.01, rpy=0.1)
     >>> sample = UncertainSample("map", "base", 0, Transform((2.0, 0.0, 0.0)), static=True, covariance=error)
-    >>> outcomes = tree.insert_many([sample, TransformStamped("base", "hand", 0, Transform((1.0, 0.0, 0.0)), static=True)])
+    >>> mount = TransformStamped("base", "hand", 0, Transform((1.0, 0.0, 0.0)), static=True)
+    >>> outcomes = tree.insert_many([sample, mount])
     >>> found = tree.lookup("map", "hand", covariance=True)
     >>> found.covariance.sigmas.round(4).tolist()
     [0.01, 0.1005, 0.1005, 0.1, 0.1, 0.1]

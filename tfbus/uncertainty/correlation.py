@@ -12,7 +12,7 @@ eigenvectors and values of W^-1/2 P W^-1/2. In the directions with D > 1/2, wher
 backwards: the common part is C = W^1/2 U min(D, 1 - D) U^T W^1/2, which is P where nothing shrinks. The stamps form a
 chain in order, each depending on the one before it only, so the covariance of all of them is positive semidefinite.
 
-*constant*: one error at all stamps: cov(e(u), e(t)) = S(u)^1/2 S(t)^1/2, which is S if the sender always gives the same.
+*constant*: one error at all stamps: cov(e(u), e(t)) = S(u)^1/2 S(t)^1/2, which is S if all are the same.
 
 *independent*: the samples' errors are independent, and between two samples the two parts of the error, of covariance
 (1 - s) S0 and s S1, are Brownian in their weight. So cov(e(u), e(t)) = (1 - s(u)) S0 + s(t) S1 between the same two
