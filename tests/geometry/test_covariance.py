@@ -88,7 +88,7 @@ def test_pytransform3d_composes_and_inverts_to_the_same_covariances(seed: int) -
         made = getattr(Covariance, f"from_{name}")
         ab, bc = made(own_a, a, rotation_first=True), made(own_b, b, rotation_first=True)
         ours = Covariance(carried(first, ab.matrix) + carried(second, bc.matrix))
-        mean, theirs = compose(own_a, own_b)
+        mean, theirs = compose(own_a, own_b)  # type: ignore[no-untyped-call]
         assert mean == pytest.approx((a @ b).matrix())
         assert getattr(ours, name)(a @ b, rotation_first=True) == pytest.approx(theirs, rel=1e-6, abs=1e-14)
     own = Covariance.from_left(own_a, a, rotation_first=True)

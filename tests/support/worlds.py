@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus import Transform
+from tfbus import Buffer, Covariance, Transform, TransformTree, UncertainSample
 from tfbus.geometry.covariance import Matrix
 
 
@@ -80,3 +80,17 @@ def is_positive(matrix: npt.NDArray[Any]) -> bool:
     unit = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
     unit[unit == 0.0] = 1.0
     return bool(np.linalg.eigvalsh(matrix / np.outer(unit, unit))[0] > -1e-9)
+
+
+def unsure(
+    parent: str, child: str, stamp: int, sigma: float = 0.1, x: float = 0.0, static: bool = False
+) -> UncertainSample:
+    error = Covariance.of(xyz=sigma)
+    return UncertainSample(parent, child, stamp, Transform((x, 0.0, 0.0)), static=static, covariance=error)
+
+
+def sigma_of(tree: TransformTree | Buffer, target: str, source: str, at: int) -> float | None:
+    """The standard deviation of x; None if the only edge counts as exact."""
+    ask = tree.lookup_nowait if isinstance(tree, Buffer) else tree.lookup
+    found = ask(target, source, at, covariance=True)
+    return None if found.exact else float(found.covariance.sigmas[0])
