@@ -21,6 +21,7 @@ from tfbus import (
     TransformStamped,
     UncertainSample,
 )
+from tfbus.data import to_message
 
 pytestmark = pytest.mark.anyio
 
@@ -112,3 +113,23 @@ def test_a_wrong_covariance_is_refused_at_the_sender(covariance: object, kind: o
     with Buffer(bus) as buffer, pytest.raises(error, match="must be"):
         TransformBroadcaster(bus).send("a", "b", Transform(), covariance=covariance, kind=kind)  # type: ignore[arg-type]
     assert not buffer.tree.frames()
+
+
+def test_messages_with_a_covariance_are_sent_with_it_and_unknown_ones_without() -> None:
+    bus = Bus(SimulatedClock())
+    sender, pose, still = TransformBroadcaster(bus), Transform((2.0, 0.0, 0.0)), (0.0, 0.0, 0.0)
+    with Buffer(bus) as buffer:
+        odometry = Odometry("odom", 5, "base", pose, still, still, pose_covariance=ERROR.matrix)
+        sender.send_message(to_message(odometry))
+        sender.send_message(PoseWithCovarianceStamped("camera", 5, pose, ERROR.matrix), "tag", invert=True)
+        sender.send_message(PoseWithCovarianceStamped("world", 5, pose, -np.eye(6)), "map")
+        assert buffer.lookup_nowait("odom", "base", covariance=True).covariance == ERROR
+        found = buffer.lookup_nowait("camera", "tag", covariance=True)
+        assert found.covariance.matrix == pytest.approx(ERROR.matrix)
+        assert found.exact == ()
+        assert buffer.lookup_nowait("world", "map", covariance=True).exact == (("world", "map"),)
+        # Out again, in the order of ROS.
+        message = to_message(found.as_pose())
+        assert message["pose"]["covariance"].tolist() == found.covariance.matrix.ravel().tolist()
+        sender.send_message({**message, "header": {"frame_id": "x", "stamp": {"sec": 0, "nanosec": 5}}}, "y")
+        assert buffer.lookup_nowait("x", "y", covariance=True).covariance.matrix == pytest.approx(ERROR.matrix)

@@ -351,7 +351,11 @@ def test_the_demo_of_events_tells_the_story_of_the_tool() -> None:
 
 @pytest.mark.parametrize(
     ("demo", "page"),
-    [("localisation", "localisation"), pytest.param("scans_in_map", "recordings", marks=pytest.mark.thorough)],
+    [
+        ("localisation", "localisation"),
+        ("how_sure", "uncertainty"),
+        pytest.param("scans_in_map", "recordings", marks=pytest.mark.thorough),
+    ],
 )
 def test_a_demo_prints_what_its_page_says(demo: str, page: str) -> None:
     said = "\n".join(output_of(f"{demo}.py", quiet=True))

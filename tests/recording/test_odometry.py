@@ -12,9 +12,11 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 from support.recorded import SMALL, write_mcap
 
-from tfbus import RecordingError, Transform
+from tfbus import Covariance, RecordingError, Transform, UncertainSample
+from tfbus.geometry.covariance import inverse_jacobian
 from tfbus.recording import load, open_recording
 
+KNOWN = Covariance(np.diag(np.arange(1.0, 7.0)) + np.eye(6, k=1) * 0.1 + np.eye(6, k=-1) * 0.1)
 CHOSEN = {"/odom": None, "/camera/pose": "camera", "/amcl": "amcl_base"}
 
 
@@ -28,7 +30,7 @@ def contents(types: Any, ros1: bool) -> list[tuple[str, str, Any]]:
     still = make("geometry_msgs/msg/Vector3", 9.0, 9.0, 9.0)
     twist = make("geometry_msgs/msg/Twist", still, still)
     spread = np.full(36, 7.0)
-    with_spread = make("geometry_msgs/msg/PoseWithCovariance", pose, spread)
+    with_spread = make("geometry_msgs/msg/PoseWithCovariance", pose, KNOWN.matrix.ravel())
     found = []
     # Names of all lengths, because the alignment depends on them.
     for k in range(8):
@@ -93,6 +95,13 @@ def test_odometry_and_poses_are_samples_at_their_own_stamps(
             assert (sample.parent, sample.child) == (edge[::-1] if invert else edge)
             assert (sample.stamp, sample.static) == (5_000_000_000 + k, False)
             assert sample.transform.is_close(pose.inverse() if invert else pose)
+            if child == "camera":
+                assert not isinstance(sample, UncertainSample)
+                continue
+            assert isinstance(sample, UncertainSample)
+            assert sample.kind == ("drift" if child.startswith("base") and not invert else "independent")
+            jacobian = inverse_jacobian(pose) if invert else np.eye(6)
+            assert sample.covariance.matrix == pytest.approx(jacobian @ KNOWN.matrix @ jacobian.T)
 
 
 @pytest.mark.parametrize(

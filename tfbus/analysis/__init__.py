@@ -2,11 +2,13 @@
 
 `diagnose` lists the faults of a tree. An `Examiner` gets the samples as they arrive, so it also finds faults that a
 tree does not show, such as duplicates and stamps that go back. `compare` gives the absolute and the relative pose error
-of a frame between two trees, as the benchmarks for SLAM define them. `Arrivals` measures rates and delays.
+of a frame between two trees, as the benchmarks for SLAM define them. `Arrivals` measures rates and delays. `nees` tests
+covariances with the truth.
 """
 
 from tfbus.analysis.arrivals import Arrival, Arrivals
 from tfbus.analysis.compare import Alignment, Comparison, PoseErrors, Statistics, compare
+from tfbus.analysis.consistency import Consistency, nees
 from tfbus.analysis.examiner import Examiner, Finding, Limits, diagnose
 
 __all__ = [
@@ -14,6 +16,7 @@ __all__ = [
     "Arrival",
     "Arrivals",
     "Comparison",
+    "Consistency",
     "Examiner",
     "Finding",
     "Limits",
@@ -21,4 +24,5 @@ __all__ = [
     "Statistics",
     "compare",
     "diagnose",
+    "nees",
 ]

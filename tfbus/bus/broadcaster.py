@@ -178,6 +178,7 @@ class TransformBroadcaster:
         message : object or mapping
             A ``TransformStamped``, ``TFMessage``, ``Odometry``, ``PoseStamped`` or ``PoseWithCovarianceStamped`` of
             ROS, as `tfbus.data.from_message` reads it, or data of `tfbus` with that name. A ``TFMessage`` is one batch.
+            A covariance that is known goes with its pose: that of odometry as a drift, that of a pose as independent.
         child : str, optional
             The frame that is at a pose. Needed for a pose, and refused for the others, which name it.
         invert : bool

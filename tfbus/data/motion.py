@@ -17,9 +17,11 @@ from tfbus.data.dispatch import (
 )
 from tfbus.data.spatial import lever, rotated, shifted
 from tfbus.frames import check_frame
+from tfbus.geometry.covariance import Covariance, Kind
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
 from tfbus.geometry.transform_array import locked
+from tfbus.geometry.uncertain import Belief, with_belief
 from tfbus.plain import PlainData
 from tfbus.rows import Quaternion, Vector, as_rotation, rotate
 from tfbus.stamps import Latest, as_array
@@ -85,7 +87,7 @@ class Odometry(CopiedByFields, PlainData):
         _set_covariances(self, 6, "pose_covariance", "twist_covariance")
 
     def as_transform(self, *, invert: bool = False) -> TransformStamped:
-        """The pose as a sample for a bus.
+        """The pose as a sample for a bus; an `UncertainSample` of a drift if its covariance is known.
 
         Parameters
         ----------
@@ -108,10 +110,18 @@ class Odometry(CopiedByFields, PlainData):
 
 
 def pose_as_transform(data: Any, child: str, *, invert: bool = False) -> TransformStamped:
-    """The pose of some data as a sample of the frame `child`; inverted, `child` is the parent."""
-    if invert:
-        return TransformStamped(child, data.frame, data.stamp, data.pose.inverse())
-    return TransformStamped(data.frame, child, data.stamp, data.pose)
+    """The pose of some data as a sample of the frame `child`; inverted, `child` is the parent.
+
+    A covariance that is known goes with it: that of odometry is a drift.
+    """
+    sample = TransformStamped(data.frame, child, data.stamp, data.pose)
+    kind: Kind = "drift" if isinstance(data, Odometry) else "independent"
+    numbers = data.pose_covariance if isinstance(data, Odometry) else getattr(data, "covariance", None)
+    covariance = None if numbers is None else Covariance.from_ros(numbers)
+    if covariance is not None:
+        sample = with_belief(sample, Belief(covariance, kind))
+    # The authority of an inverse is empty, as that of the sample.
+    return ~sample if invert else sample
 
 
 @dataclass(frozen=True, slots=True, eq=False)

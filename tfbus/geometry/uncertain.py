@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Unpack
 
-from tfbus.geometry.covariance import Covariance, Kind, as_covariance, as_kind
+from tfbus.geometry.covariance import Covariance, Kind, as_covariance, as_kind, covariance_of, inverse_jacobian
 from tfbus.geometry.stamped import Changes, TransformStamped
 from tfbus.geometry.transform import Transform
 from tfbus.plain import StampsAs
@@ -81,7 +81,14 @@ class UncertainSample(TransformStamped):
         return self.belief.kind
 
     def replace(self, **changes: Unpack[Changes]) -> UncertainSample:
-        """As `TransformStamped.replace`; the covariance stays."""
+        """As `TransformStamped.replace`; the covariance stays.
+
+        Examples
+        --------
+        >>> sample = UncertainSample("map", "cart", 0, Transform(), covariance=Covariance.of(xyz=0.1))
+        >>> sample.replace(stamp=10).covariance == sample.covariance
+        True
+        """
         return with_belief(super().replace(**changes), self.belief)
 
     __replace__ = replace
@@ -89,8 +96,32 @@ class UncertainSample(TransformStamped):
     def _take(self, other: Any) -> None:
         self.belief = other.belief
 
+    def inverse(self) -> UncertainSample:
+        """The sample in the other direction, with the names of the two frames exchanged; also as ``~t``.
+
+        The errors of a drift become independent ones, which says less: seen from the body, the motion that adds an
+        error does not carry the older ones along.
+
+        Examples
+        --------
+        >>> error = Covariance.of(rpy=(0.0, 0.0, 0.1))
+        >>> sample = UncertainSample("odom", "base", 0, Transform((2.0, 0.0, 0.0)), covariance=error, kind="drift")
+        >>> (~sample).covariance.sigmas.round(9).tolist(), (~sample).kind
+        ([0.0, 0.2, 0.0, 0.0, 0.0, 0.1], 'independent')
+        """
+        jacobian = inverse_jacobian(self.transform)
+        covariance = covariance_of(jacobian @ self.covariance.matrix @ jacobian.T)
+        kind: Kind = "independent" if self.kind == "drift" else self.kind
+        return with_belief(super().inverse(), Belief(covariance, kind))
+
     def to_dict(self, *, stamps: StampsAs = "int") -> dict[str, Any]:
-        """As `TransformStamped.to_dict`, with ``"covariance"``, 36 numbers row by row, and ``"kind"``."""
+        """As `TransformStamped.to_dict`, with ``"covariance"``, 36 numbers row by row, and ``"kind"``.
+
+        Examples
+        --------
+        >>> UncertainSample("map", "cart", 0, Transform(), covariance=Covariance.of(xyz=0.1)).to_dict()["kind"]
+        'independent'
+        """
         return {**super().to_dict(stamps=stamps), "covariance": self.covariance.to_dict(), "kind": self.kind}
 
     @classmethod
@@ -101,6 +132,12 @@ class UncertainSample(TransformStamped):
         ------
         ValueError
             As `TransformStamped.from_dict`; or if there is no valid covariance and kind.
+
+        Examples
+        --------
+        >>> sample = UncertainSample("map", "cart", 0, Transform(), covariance=Covariance.of(xyz=0.1))
+        >>> UncertainSample.from_dict(sample.to_dict()).covariance == sample.covariance
+        True
         """
         fields = {name: value for name, value in data.items() if name not in ("covariance", "kind")}
         covariance, kind = Covariance(data.get("covariance", ())), as_kind(data.get("kind", "independent"))

@@ -28,6 +28,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from tfbus.data import PoseWithCovarianceStamped
 from tfbus.geometry.covariance import Covariance, Matrix, covariance_of, lever_arm, root_of, turned
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform_array import TransformArray, from_columns, locked
@@ -63,7 +64,16 @@ class Link(NamedTuple):
 
 
 class Share(NamedTuple):
-    """The part of an answer's covariance that one edge contributes."""
+    """The part of an answer's covariance that one edge contributes.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> _ = tree.insert(UncertainSample("map", "base", 0, Transform(), covariance=Covariance.of(xyz=0.5)))
+    >>> (share,) = tree.lookup("map", "base", covariance=True).shares()
+    >>> share.parent, share.child, float(share.matrix[0, 0])
+    ('map', 'base', 0.25)
+    """
 
     parent: str
     child: str
@@ -136,9 +146,7 @@ class UncertainTransform(TransformStamped):
         return not rotations or math.sqrt(sum(float(np.linalg.eigvalsh(m)[-1]) for m in rotations)) <= LINEAR
 
     def shares(self) -> list[Share]:
-        """The contribution of each edge that gave a covariance, the greatest first.
-
-        Two edges are compared by the greatest share of a standard deviation along any of the six axes.
+        """The contribution of each edge that gave a covariance: first the one with the most of the position's variance.
 
         Examples
         --------
@@ -148,8 +156,7 @@ class UncertainTransform(TransformStamped):
         ['base']
         """
         found = [Share(*name, matrix) for name, matrix in joint([self])._by_edge()]
-        total = np.maximum(self.covariance.matrix.diagonal(), 1e-300)
-        return sorted(found, key=lambda share: -float((share.matrix.diagonal() / total).max()))
+        return sorted(found, key=lambda share: np.trace(share.matrix[:3, :3]).item(), reverse=True)
 
     def sample(self, n: int, rng: np.random.Generator | int | None = None) -> TransformArray:
         """`n` transforms drawn from the answer's distribution: the edges are drawn, and composed exactly.
@@ -201,8 +208,28 @@ class UncertainTransform(TransformStamped):
             found = found + turn @ np.asarray(covariances, np.float64) @ turn.T
         return np.asarray(transform.apply(own)), found
 
+    def as_pose(self) -> PoseWithCovarianceStamped:
+        """The pose of the source in the target as data with a covariance, for a message of ROS.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(UncertainSample("map", "base", 0, Transform(), covariance=Covariance.of(xyz=0.5)))
+        >>> float(tree.lookup("map", "base", covariance=True).as_pose().covariance[0, 0])
+        0.25
+        """
+        return PoseWithCovarianceStamped(self.parent, self.stamp, self.transform, self.covariance.matrix)
+
     def inverse(self) -> UncertainTransform:
-        """The transform in the other direction, with its error."""
+        """The transform in the other direction, with its error.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(UncertainSample("map", "base", 0, Transform(), covariance=Covariance.of(xyz=0.5)))
+        >>> tree.lookup("map", "base", covariance=True).inverse().covariance.sigmas[0].item()
+        0.5
+        """
         links = tuple(link._replace(climbs=not link.climbs) for link in reversed(self.links))
         return uncertain(super().inverse(), links)
 
@@ -236,6 +263,14 @@ class UncertainTransformArray(TransformArray):
         One for each answer, in the order of `Covariance`; NaN where there is no answer.
     exact : tuple of (str, str)
         The edges, as (parent, child), that gave no covariance at one of the stamps, and count as exact there.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> for stamp, sigma in ((0, 1.0), (10, 2.0)):
+    ...     _ = tree.insert(UncertainSample("a", "b", stamp, Transform(), covariance=Covariance.of(xyz=sigma)))
+    >>> tree.lookup_many("a", "b", [0, 5, 10], covariance=True).covariances[:, 0, 0].tolist()
+    [1.0, 2.5, 4.0]
     """
 
     __slots__ = ("covariances", "exact")
@@ -298,13 +333,33 @@ class JointAnswers:
         return 0.5 * (found + found.T)
 
     def difference(self, i: int, j: int) -> Matrix:
-        """The covariance of error j less error i, shape (6, 6); the two answers should have the same target."""
+        """The covariance of error j less error i, shape (6, 6); the two answers should have the same target.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> for stamp, sigma in ((0, 3.0), (10, 5.0)):
+        ...     error = Covariance.of(xyz=sigma)
+        ...     _ = tree.insert(UncertainSample("odom", "base", stamp, Transform(), covariance=error, kind="drift"))
+        >>> both = joint([tree.lookup("odom", "base", stamp, covariance=True) for stamp in (0, 10)])
+        >>> both.difference(0, 1)[0, 0].item()
+        16.0
+        """
         a, b = slice(6 * i, 6 * i + 6), slice(6 * j, 6 * j + 6)
         whole = self.covariance
         return np.asarray(whole[a, a] + whole[b, b] - whole[a, b] - whole[b, a])
 
     def sample(self, n: int, rng: np.random.Generator | int | None = None) -> tuple[TransformArray, ...]:
-        """`n` draws of each answer; draw k of one answer has the same errors of edges as draw k of another."""
+        """`n` draws of each answer; draw k of one answer has the same errors of edges as draw k of another.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(UncertainSample("map", "base", 0, Transform(), covariance=Covariance.of(xyz=0.5)))
+        >>> found = tree.lookup("map", "base", covariance=True)
+        >>> [len(drawn) for drawn in joint([found, found]).sample(3)]
+        [3, 3]
+        """
         source = np.random.default_rng(rng)
         drawn: dict[tuple[Name, int], Matrix] = {}
         for name, errors in self._errors().items():

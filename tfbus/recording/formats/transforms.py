@@ -24,7 +24,9 @@ import numpy.typing as npt
 
 from tfbus.errors import pip_install
 from tfbus.frames import is_frame
+from tfbus.geometry.covariance import Covariance
 from tfbus.geometry.stamped import TransformStamped, renamed
+from tfbus.geometry.uncertain import Belief, with_belief
 from tfbus.recording.formats.storage import (
     AUTHORITIES,
     MAX_MESSAGE,
@@ -371,6 +373,7 @@ class ChannelDecoder:
         MalformedMessageError
         """
         payload = bounded(payload)
+        covariance = self._covariance(payload)
         if not self._is_cdr:
             payload = write_cdr(self.parse(payload))
         order: Literal["little", "big"] = "little" if payload[1:2] == b"\1" else "big"
@@ -378,9 +381,20 @@ class ChannelDecoder:
         decoded = decode(payload, self._tags(count), bare_names=True)
         if self.prefix:
             decoded.samples[:] = map(self._prefixed, decoded.samples)
+        if covariance is not None:
+            belief = Belief(covariance, "drift" if self.channel.type in _ODOMETRY else "independent")
+            decoded.samples[:] = [sample and with_belief(sample, belief) for sample in decoded.samples]
         if self._invert:
             decoded.samples[:] = [sample and ~sample for sample in decoded.samples]
         return decoded
+
+    def _covariance(self, payload: bytes) -> Covariance | None:
+        """The covariance of a pose, if its message has one that is known."""
+        behind = _ODOMETRY.get(self.channel.type) or _POSES.get(self.channel.type, 0)
+        if not behind or len(payload) < behind:
+            return None
+        order = ">" if self.channel.encoding == "cdr" and payload[1:2] == b"\0" else "<"
+        return Covariance.from_ros(np.frombuffer(payload, f"{order}f8", 36, len(payload) - behind))
 
     def count(self, payload: bytes) -> int:
         """The number of transforms in a message; raises `MalformedMessageError` as `parse`."""
