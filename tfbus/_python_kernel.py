@@ -33,7 +33,7 @@ class Sample:
     __slots__ = ("_fields",)
     _fields: tuple[str, str, int, Row, str, bool]
     _is_plain = True
-    """Whether it knows nothing beyond its fields. The kernel hands other samples back."""
+    """Whether the class knows nothing that Python has to note. The kernel hands other samples back."""
 
     @property
     def parent(self) -> str:

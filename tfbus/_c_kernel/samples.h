@@ -197,14 +197,32 @@ batch_size(PyObject *batch)
     return PyTuple_CheckExact(batch) ? PyTuple_Size(batch) : ((Columns *)batch)->count;
 }
 
-/* The class of the samples that know nothing beyond their fields; NULL until the first Paths. Borrowed, and only
- * compared. Python stores every other sample, because it notes what the sample knows more, such as a covariance. */
+/* The class of usual samples; NULL until the first Paths. Borrowed, and only compared. */
 static PyObject *plain_kind;
+/* Another class that was met last, and whether its samples know more than their fields. */
+static PyObject *met_kind;
+static int met_knows_more;
 
+/* Whether Python has to store a sample, because it notes what the sample knows more, such as a covariance: then its
+ * class has a false `_is_plain`. */
 static int
 knows_more(const Sample *sample)
 {
-    return plain_kind != NULL && OBJECT(Py_TYPE(OBJECT(sample))) != plain_kind;
+    PyObject *kind = OBJECT(Py_TYPE(OBJECT(sample)));
+    if (kind == plain_kind) {
+        return 0;
+    }
+    if (kind != met_kind) {
+        PyObject *before = met_kind, *is_plain = PyObject_GetAttrString(kind, "_is_plain");
+        if (is_plain == NULL) {
+            PyErr_Clear();
+        }
+        met_knows_more = is_plain == Py_False;
+        met_kind = Py_NewRef(kind);
+        Py_XDECREF(is_plain);
+        Py_XDECREF(before);
+    }
+    return met_knows_more;
 }
 
 static int
