@@ -17,15 +17,18 @@ from tfbus import (
     SECOND,
     Buffer,
     Bus,
+    Covariance,
     Explanation,
     FutureExtrapolationError,
     Hold,
     InvalidTransformError,
     Latest,
     SimulatedClock,
+    Transform,
     TransformLookupError,
     TransformStamped,
     TransformTree,
+    UncertainSample,
     UnknownFrameError,
     from_seconds,
 )
@@ -353,3 +356,23 @@ def test_an_explanation_is_plain_data_and_comes_back() -> None:
         assert str(back) == str(found)
         assert back.edges[:2] == found.edges[:2] or not found.answerable
         assert [type(error) for error in back.errors] == [type(error) for error in found.errors]
+
+
+def test_an_explanation_tells_which_edge_an_error_comes_from() -> None:
+    tree = TransformTree()
+    assert tree_of(moving("a", "b", 0)).explain("a", "b").sigmas == ()
+    yaw, place = Covariance.of(rpy=(0.0, 0.0, 0.01)), Covariance.of(xyz=(0.0, 0.04, 0.0))
+    tree.insert(UncertainSample("map", "base\n", 0, Transform(), covariance=yaw))
+    tree.insert(UncertainSample("base\n", "arm", 0, Transform((3.0, 0.0, 0.0)), static=True, covariance=place))
+    tree.insert(static("arm", "hand"))
+    found = tree.explain("map", "hand")
+    # 3 m times 0.01 rad, and 0.04 m: 0.05 m.
+    assert found.sigmas == pytest.approx((0.0, 0.05, 0.0, 0.0, 0.0, 0.01))
+    assert [edge.shares[1:2] for edge in found.edges] == [(pytest.approx(0.36),), (pytest.approx(0.64),), ()]
+    assert str(found).splitlines()[-4:] == [
+        "~ error of one sigma: x 0, y 0.05, z 0 m, roll 0, pitch 0, yaw 0.01 rad",
+        r"  64% of the variance of y is from base\n -> arm",
+        r"  100% of the variance of yaw is from map -> base\n",
+        "  taken as exact: arm -> hand",
+    ]
+    assert Explanation.from_dict(found.to_dict()) == found

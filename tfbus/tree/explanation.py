@@ -5,10 +5,12 @@ insertions. Formatting an `Explanation` as text needs no lock.
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from itertools import pairwise
 from typing import NamedTuple
+
+import numpy as np
 
 from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError, UnknownFrameError
 from tfbus.plain import PlainData, printable
@@ -17,6 +19,7 @@ from tfbus.tree.forest import AT_A_TIME, Forest, Path
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import At, Bounds, Extrapolation, Policy, find, read_stamp
 from tfbus.tree.rendering import counted, format_rate
+from tfbus.tree.uncertain import uncertain_answer
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,9 @@ class ExplainedEdge(PlainData):
         The sender of the newest sample; may be empty.
     error : ExtrapolationError or None
         The reason why this edge blocks the answer.
+    shares : tuple of 6 floats
+        The part of the variance of each number of the answer's error that comes from this edge, in the order of
+        `Covariance`; empty if the edge gave no covariance.
 
     Examples
     --------
@@ -66,6 +72,7 @@ class ExplainedEdge(PlainData):
     rate: float | None = None
     authority: str = ""
     error: ExtrapolationError | None = None
+    shares: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -90,6 +97,9 @@ class Explanation(PlainData):
         One for each two neighbours in the chain, in its order; or in the two half chains, target's first.
     errors : tuple of TransformLookupError
         All errors that block the answer, among them the error that a lookup raises.
+    sigmas : tuple of 6 floats
+        The standard deviations of the answer's error, in the order of `Covariance`, in m and rad; empty if no edge gave
+        a covariance.
 
     Examples
     --------
@@ -108,6 +118,7 @@ class Explanation(PlainData):
     half_chains: tuple[tuple[str, ...], ...] = ()
     edges: tuple[ExplainedEdge, ...] = ()
     errors: tuple[TransformLookupError, ...] = ()
+    sigmas: tuple[float, ...] = ()
 
     @property
     def answerable(self) -> bool:
@@ -141,7 +152,23 @@ class Explanation(PlainData):
             lines.append(f"! {error}")
             if isinstance(error.__cause__, TransformLookupError):
                 lines.append(f"  because {error.__cause__}")
-        return "\n".join(lines)
+        return "\n".join(lines + self._told_errors())
+
+    def _told_errors(self) -> list[str]:
+        """The lines on the answer's error: its size, the edge that most of it comes from, and the exact edges."""
+        if not self.sigmas:
+            return []
+        x, y, z, roll, pitch, yaw = (f"{sigma:.3g}" for sigma in self.sigmas)
+        lines = [f"~ error of one sigma: x {x}, y {y}, z {z} m, roll {roll}, pitch {pitch}, yaw {yaw} rad"]
+        known = [edge for edge in self.edges if edge.shares]
+        for half in (range(3), range(3, 6)):
+            axis = max(half, key=self.sigmas.__getitem__)
+            if self.sigmas[axis]:
+                shares = [edge.shares[axis] for edge in known]
+                most = known[shares.index(max(shares))]
+                lines.append(f"  {most.shares[axis]:.0%} of the variance of {_AXES[axis]} is from {_edge_text(most)}")
+        exact = [_edge_text(edge) for edge in self.edges if not edge.shares]
+        return [*lines, f"  taken as exact: {', '.join(exact)}"] if exact else lines
 
     def _top(self) -> int:
         """The number of edges from target up to the common ancestor; the later edges lead down to source."""
@@ -149,6 +176,13 @@ class Explanation(PlainData):
             if not self.half_chains and edge.parent == self.chain[place]:
                 return place
         return len(self.edges)
+
+
+_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def _edge_text(edge: ExplainedEdge) -> str:
+    return f"{printable(edge.parent)} -> {printable(edge.child)}"
 
 
 def _cells(edge: ExplainedEdge, now: int | None, below: bool) -> list[str]:
@@ -231,7 +265,36 @@ def explain(
     if raised is not None and raised not in errors:
         errors = (raised, *errors)
     chain = () if found.path is None else found.path.frames
-    return Explanation(target, source, at, found.stamp, now, chain, found.half_chains, tuple(edges), errors)
+    sigmas: tuple[float, ...] = ()
+    if found.stamp is not None and any(_is_unsure(forest, child) for child, _ in links):
+        sigmas, edges = _with_shares(forest, target, source, found.stamp, policy, edges)
+    return Explanation(target, source, at, found.stamp, now, chain, found.half_chains, tuple(edges), errors, sigmas)
+
+
+def _is_unsure(forest: Forest, child: str) -> bool:
+    edge = forest.frames.get(child)
+    return edge is not None and edge.beliefs is not None
+
+
+def _with_shares(
+    forest: Forest, target: str, source: str, stamp: int, policy: Policy | None, edges: list[ExplainedEdge]
+) -> tuple[tuple[float, ...], list[ExplainedEdge]]:
+    """The standard deviations of an answer's error, and its edges with their shares of the variances."""
+    try:
+        answer = uncertain_answer(forest, target, source, stamp, None, None, None, policy)
+    except TransformLookupError:
+        # Its samples have left the window meanwhile.
+        return (), edges
+    total = answer.covariance.matrix.diagonal()
+    scale = np.divide(1.0, total, out=np.zeros(6), where=total > 0.0)
+    shares = {(share.parent, share.child): share.matrix.diagonal() * scale for share in answer.shares()}
+    shared = [
+        replace(edge, shares=tuple(shares[edge.parent, edge.child].tolist()))
+        if (edge.parent, edge.child) in shares
+        else edge
+        for edge in edges
+    ]
+    return tuple(answer.covariance.sigmas.tolist()), shared
 
 
 def _find(forest: Forest, target: str, source: str, at: At, bounds: Bounds | None, policy: Policy | None) -> _Finding:
