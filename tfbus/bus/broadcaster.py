@@ -99,7 +99,6 @@ class TransformBroadcaster:
         child: str,
         transform: Transform,
         at: StampLike | None = None,
-        *,
         covariance: Covariance | None = None,
         kind: Kind = "independent",
     ) -> None:

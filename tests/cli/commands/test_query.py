@@ -3,10 +3,12 @@
 import csv
 import json
 import re
+import struct
 from collections import Counter
 from io import StringIO
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.commands import Command, check_wrong_call
 from support.recorded import SMALL, Line, write_mcap
@@ -290,3 +292,25 @@ def test_poses_of_a_recording_are_read_as_the_transforms_of_a_frame(tmp_path: Pa
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.splitlines()[1].startswith("5000000000,-1.0,-2.0,-3.0,")
     check_wrong_call(tfbus("query", path, "camera", "map", "--invert"), "--invert is for the topics of --odometry")
+
+
+def test_sigmas_are_those_of_the_odometry_and_edges_without_are_named(tmp_path: Path, tfbus: Command) -> None:
+    lines: list[tuple[int, str, bytes]] = []
+    for second in range(3):
+        # A pose with its covariance, and a twist with another.
+        head = struct.pack("<4xiII5s3xI5s3x", second, 0, 5, b"odom\0", 5, b"base\0")
+        spread = np.diag([0.01, 0.04, 0.0, 0.0, 0.0, 1e-4]) * (1 + second)
+        numbers = np.concatenate(((2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), spread.ravel(), np.full(42, 3.0)))
+        lines.append((second, "/odom", b"\0\1" + head[2:] + numbers.astype("<f8").tobytes()))
+    path = write_mcap(tmp_path / "odometry.mcap", lines, schema="nav_msgs/msg/Odometry")
+    asked = ("query", path, "odom", "base", "--odometry", "/odom", "--sigmas")
+    done = tfbus(*asked, "--every", "0.5", "--csv")
+    assert done.stderr == ""
+    rows = list(csv.DictReader(StringIO(done.stdout)))
+    assert [float(row["sigma_x_m"]) for row in rows] == pytest.approx([(0.01 * k) ** 0.5 for k in (1, 1.5, 2, 2.5, 3)])
+    assert [float(row["sigma_yaw"]) for row in rows][::4] == pytest.approx([0.01, 0.01 * 3**0.5])
+    assert json.loads(tfbus(*asked, "--json", "--at", "0").stdout)["sigmas"] == pytest.approx([0.1, 0.2, 0, 0, 0, 0.01])
+    assert "yaw ±" in tfbus(*asked).stdout
+    plain = write_mcap(tmp_path / "plain.mcap", [(0, "/tf", [moving("map", "base", 0)])])
+    assert "taken as exact: map -> base" in tfbus("query", plain, "map", "base", "--sigmas").stderr
+    check_wrong_call(tfbus("query", plain, "map", "base", "--sigmas", "--tum"), "--sigmas is for tables")

@@ -49,6 +49,11 @@ class Row(NamedTuple):
     stamp: int
     translation: Vector
     rotation: Quaternion
+    sigmas: tuple[float, ...] = ()
+    """The standard deviations of the error, in the order of `SIGMA_NAMES`, if they were asked for."""
+
+
+SIGMA_NAMES = ("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_roll", "sigma_pitch", "sigma_yaw")
 
 
 def query(
@@ -67,6 +72,7 @@ def query(
     kitti: Flag = False,
     euroc: Flag = False,
     parquet: Path | None = None,
+    sigmas: Flag = False,
     max_speed: Positive | None = None,
     topics: TopicOptions = DEFAULT_TOPICS,
 ) -> None:
@@ -109,6 +115,9 @@ def query(
         Print lines of stamp,x,y,z,qw,qx,qy,qz, the format of EuRoC's trajectories, with stamps in ns.
     parquet
         Write a Parquet file instead.
+    sigmas
+        Add the standard deviations of the error, in m and rad, as --odometry brings them. Edges without any count as
+        exact, and standard error names them.
     max_speed
         Leave out transforms that a frame can only have reached at a higher speed than this, in m/s.
     """
@@ -122,24 +131,41 @@ def query(
         raise UsageError("--at, --every, --own-stamps and --stamps-of are different questions: give one of them")
     if kinds and kinds[0] in _TRAJECTORIES and len(pairs) > 1:
         raise UsageError(f"--{kinds[0]} has no names of frames: ask for one pair")
+    if sigmas and (parquet is not None or (kinds and kinds[0] in _TRAJECTORIES)):
+        raise UsageError("--sigmas is for tables, --csv and --json: no other format has a place for them")
     tree, start = load_tree(file, topics, max_speed)
     stamps = None if stamps_of is None else _stamps_of(file, stamps_of)
 
     def rows() -> Iterator[Row]:
         for pair in pairs:
             if own_stamps and len(own := tree.stamps(*pair)):
-                yield from _rows_at(tree, *pair, own)
+                found = _rows_at(tree, *pair, own)
             elif every is not None:
-                yield from _rows_at_intervals(tree, *pair, every)
+                found = _rows_at_intervals(tree, *pair, every)
             elif stamps is not None:
-                yield from _rows_at(tree, *pair, stamps)
+                found = _rows_at(tree, *pair, stamps)
             else:
-                yield from _one_row(tree, *pair, None if at is None else at.stamp(start))
+                found = _one_row(tree, *pair, None if at is None else at.stamp(start))
+            yield from _with_sigmas(tree, pair, found) if sigmas else found
 
     if parquet is not None:
         write_parquet(rows(), parquet)
     else:
         print_rows(rows(), kinds[0] if kinds else "table", several=len(pairs) > 1)
+
+
+def _with_sigmas(tree: TransformTree, pair: tuple[str, str], rows: Iterator[Row]) -> Iterator[Row]:
+    """The rows with the standard deviations of their errors."""
+    exact: dict[tuple[str, str], None] = {}
+    while part := list(islice(rows, _CHUNK)):
+        found = tree.lookup_many(*pair, [row.stamp for row in part], covariance=True)
+        exact |= dict.fromkeys(found.exact)
+        deviations = np.sqrt(np.maximum(found.covariances.diagonal(axis1=1, axis2=2), 0.0)).tolist()
+        for row, sigmas in zip(part, deviations, strict=True):
+            yield row._replace(sigmas=tuple(sigmas))
+    if exact:
+        names = ", ".join(f"{parent} -> {child}" for parent, child in exact)
+        warn(f"no covariance, and taken as exact: {names}")
 
 
 def _pairs(target: str, source: str, further: Sequence[str]) -> list[tuple[str, str]]:
@@ -258,15 +284,20 @@ def write_parquet(rows: Iterator[Row], path: Path) -> None:
 
 def _print_csv(rows: Iterator[Row], several: bool) -> None:
     out = csv_writer()
-    out.writerow((*(("target", "source") if several else ()), "stamp_ns", *COLUMN_NAMES))
-    for row in rows:
-        pair = (csv_name(row.target), csv_name(row.source)) if several else ()
-        out.writerow((*pair, row.stamp, *row.translation, *row.rotation))
+    for first in islice(rows, 1):
+        names = SIGMA_NAMES if first.sigmas else ()
+        out.writerow((*(("target", "source") if several else ()), "stamp_ns", *COLUMN_NAMES, *names))
+        for row in chain((first,), rows):
+            pair = (csv_name(row.target), csv_name(row.source)) if several else ()
+            out.writerow((*pair, row.stamp, *row.translation, *row.rotation, *row.sigmas))
 
 
 def _print_json(rows: Iterator[Row], _: bool) -> None:
     for row in rows:
-        print(json.dumps({**row._asdict(), "stamp": format_seconds(row.stamp)}))
+        fields = {**row._asdict(), "stamp": format_seconds(row.stamp)}
+        if not row.sigmas:
+            del fields["sigmas"]
+        print(json.dumps(fields))
 
 
 def _print_trajectory(name: Format) -> Callable[[Iterator[Row], bool], None]:
@@ -289,9 +320,10 @@ def _print_table(rows: Iterator[Row], several: bool) -> None:
                 heading = f"{row.source} in {row.target}"
                 print(*([] if pair is None else [""]), *wrapped(heading, width, 2), sep="\n")
             titles = [f"{name:>{_NUMBER}}" for name in ("x [m]", "y [m]", "z [m]", *COLUMN_NAMES[3:])]
+            titles += [f"{name.removeprefix('sigma_'):>{_NUMBER - 2}} ±" for name in SIGMA_NAMES[: len(row.sigmas)]]
             print(f"{'stamp [s]':>{_STAMP}}{''.join(titles[:3])}{between}{''.join(titles[3:])}")
             pair = row[:2]
-        values = [_number(value) for value in (*row.translation, *row.rotation)]
+        values = [_number(value) for value in (*row.translation, *row.rotation, *row.sigmas)]
         print(f"{format_seconds(row.stamp):>{_STAMP}}{''.join(values[:3])}{between}{''.join(values[3:])}")
 
 
