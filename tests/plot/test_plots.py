@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from support.samples import over, static, tree_of
 
-from tfbus import SECOND, Transform, TransformStamped, TransformTree
+from tfbus import SECOND, Covariance, Transform, TransformStamped, TransformTree, UncertainSample
 from tfbus.analysis import compare
 from tfbus.errors import UnknownFrameError
 from tfbus.plot import Reception, plot_errors, plot_gaps, plot_path, plot_transforms
@@ -258,3 +258,20 @@ def test_the_figure_is_drawn_and_then_shown(monkeypatch: pytest.MonkeyPatch) -> 
 def test_no_two_of_28_lines_look_alike() -> None:
     styles = [tuple(style.items()) for style in line_styles(28)]
     assert len(set(styles)) == len(styles) == 28
+
+
+def test_a_band_of_two_sigma_is_around_poses_with_a_covariance() -> None:
+    assert not any(axes.collections for axes in plot_transforms(TREE, "map", "a").axes)
+    tree, turn = TransformTree(), Transform.from_xyz_rpy((1.0, 0.0, 0.0), (0.0, 0.5, 1.0))
+    for second, sigma in ((0, 0.1), (1, 0.2)):
+        error = Covariance.of(xyz=(sigma, 0.0, 0.0), rpy=(0.0, 0.01, 0.0))
+        tree.insert(UncertainSample("map", "a", second * SECOND, turn, covariance=error))
+    figure = plot_transforms(tree, "map", "a")
+    bands = [axes.collections[0].get_datalim(axes.transData) for axes in figure.axes]
+    # y is 0 and exact; x is 1 within 2 sigma, which is 0.2 m at the end.
+    assert (bands[0].y0, bands[0].y1) == pytest.approx((0.6, 1.4))
+    widths = [band.height / 4.0 for band in bands]
+    # By a rotation about the fixed y.
+    expected = [math.sin(1.0) / math.cos(0.5), math.cos(1.0), math.sin(1.0) * math.tan(0.5)]
+    assert widths[1::2] == pytest.approx([math.degrees(0.01 * part) for part in expected])
+    assert widths[2::2] == pytest.approx([0.0, 0.0])

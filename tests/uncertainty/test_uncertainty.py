@@ -313,6 +313,14 @@ def test_points_move_with_the_lever_arm_and_their_own_error() -> None:
     assert spread[1] == pytest.approx(np.diag([4.0 + 1e-4, 1.0 + 4e-4, 9.0 + 9e-4]), abs=1e-12)
 
 
+def test_the_ellipsoid_has_the_covariance_of_the_position() -> None:
+    for seed in range(5):
+        found, _ = random_chain(np.random.default_rng(seed), 0.05, 100)
+        axes, rotation = found.ellipsoid(3.0)
+        turn = Transform(rotation=rotation).matrix()[:3, :3]
+        assert turn @ np.diag(np.square(axes)) @ turn.T / 9.0 == pytest.approx(found.covariance.matrix[:3, :3])
+
+
 def test_an_answer_survives_pickling_with_its_error() -> None:
     found, _ = random_chain(np.random.default_rng(11), 0.05, 100)
     twin = pickle.loads(pickle.dumps(found))

@@ -26,6 +26,7 @@ from tfbus.plain import printable
 from tfbus.recording.recording import RecordedMessage
 from tfbus.stamps import SECOND, Stamps, format_stamp, time_between
 from tfbus.tree.tree import TransformTree, moving_edges
+from tfbus.uncertainty import UncertainTransformArray
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 """The colours of M. Okabe and K. Ito, "Color Universal Design" (2008)."""
@@ -110,6 +111,7 @@ def show_in_window(draw: Callable[[Figure], object]) -> None:
 Floats = npt.NDArray[np.float64]
 
 SAMPLES = 2_000
+_NEAR_GIMBAL_LOCK = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,6 +131,8 @@ class Series:
         Roll, pitch and yaw in degrees, about fixed axes; from -180 to 180, pitch from -90 to 90.
     static : bool
         Whether the pose holds at every stamp.
+    sigmas : array of shape (n, 6), optional
+        The standard deviations of x, y, z in m and of roll, pitch, yaw in degrees; None if no edge gave a covariance.
     """
 
     target: str
@@ -138,6 +142,7 @@ class Series:
     translations: Floats
     angles: Floats
     static: bool
+    sigmas: Floats | None = None
 
     @property
     def start(self) -> int:
@@ -164,13 +169,37 @@ def read_series(tree: TransformTree, target: str, source: str, samples: int = SA
     """
     if samples < 2:
         raise ValueError(f"a series has at least two samples, not {samples}")
-    newest = tree.lookup(target, source)
+    newest = tree.lookup(target, source, covariance=True)
+    unsure = any(link.error is not None for link in newest.links)
     first, last = _span(tree)
     start, end = (first, last) if newest.static else _common_span(tree, target, source, newest.stamp)
     stamps = start + ((end - start) * np.arange(samples, dtype=object) // (samples - 1)).astype(np.int64)
-    found = tree.lookup_many(target, source, stamps, out_of_range="nan")
+    found = tree.lookup_many(target, source, stamps, out_of_range="nan", covariance=unsure)
     seconds = time_between(np.full_like(stamps, first), stamps).astype(np.float64) / SECOND
-    return Series(target, source, stamps, seconds, found.translations, np.degrees(found.as_rpy()), newest.static)
+    angles = found.as_rpy()
+    sigmas = _sigmas(found, angles) if isinstance(found, UncertainTransformArray) else None
+    return Series(target, source, stamps, seconds, found.translations, np.degrees(angles), newest.static, sigmas)
+
+
+def _sigmas(found: UncertainTransformArray, angles: Floats) -> Floats:
+    """The standard deviations of positions and of angles; see `Series`.
+
+    A rotation w about the fixed axes turns the angles by the inverse of the kinematic matrix of roll, pitch and yaw
+    (Diebel, "Representing Attitude", 2006, section 5.6.4); near a pitch of 90 degrees, roll and yaw are not known.
+    """
+    _, pitch, yaw = angles.T
+    cosine = np.where(np.abs(np.cos(pitch)) < _NEAR_GIMBAL_LOCK, np.nan, np.cos(pitch))
+    zero, one = np.zeros(len(angles)), np.ones(len(angles))
+    to_angles = np.array(
+        [
+            [np.cos(yaw) / cosine, np.sin(yaw) / cosine, zero],
+            [-np.sin(yaw), np.cos(yaw), zero],
+            [np.cos(yaw) * np.sin(pitch) / cosine, np.sin(yaw) * np.sin(pitch) / cosine, one],
+        ]
+    ).transpose(2, 0, 1)
+    places = found.covariances[:, range(3), range(3)]
+    turns = (to_angles @ found.covariances[:, 3:, 3:] @ to_angles.swapaxes(1, 2))[:, range(3), range(3)]
+    return np.hstack((np.sqrt(np.maximum(places, 0.0)), np.degrees(np.sqrt(np.maximum(turns, 0.0)))))
 
 
 def _span(tree: TransformTree) -> tuple[int, int]:
@@ -411,7 +440,8 @@ def plot_transforms(
     Returns
     -------
     matplotlib.figure.Figure
-        With six axes. A line has a break where there is no answer, and where an angle passes 180 degrees.
+        With six axes. A line has a break where there is no answer, and where an angle passes 180 degrees. A band of two
+        standard deviations is around poses with a covariance.
 
     Raises
     ------
@@ -427,6 +457,10 @@ def plot_transforms(
         for column, values in enumerate((series.translations, _with_breaks(series.angles))):
             for row in range(3):
                 axes[row, column].plot(series.seconds, values[:, row], label=label, **style)
+                if series.sigmas is not None:
+                    width = 2.0 * series.sigmas[:, 3 * column + row]
+                    low, high = values[:, row] - width, values[:, row] + width
+                    axes[row, column].fill_between(series.seconds, low, high, color=style["color"], alpha=0.2, lw=0)
     for row in range(3):
         for column in range(2):
             axes[row, column].set_ylabel(_NAMES[column][row])

@@ -31,8 +31,9 @@ import numpy as np
 from tfbus.data import PoseWithCovarianceStamped
 from tfbus.geometry.covariance import Covariance, Matrix, covariance_of, lever_arm, root_of, turned
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.transform import Transform
 from tfbus.geometry.transform_array import TransformArray, from_columns, locked
-from tfbus.rows import IDENTITY, Columns, Row, compose, invert
+from tfbus.rows import IDENTITY, Columns, Quaternion, Row, Vector, compose, invert
 from tfbus.uncertainty.correlation import EdgeError, covariances
 
 LINEAR = 0.125
@@ -207,6 +208,35 @@ class UncertainTransform(TransformStamped):
         if covariances is not None:
             found = found + turn @ np.asarray(covariances, np.float64) @ turn.T
         return np.asarray(transform.apply(own)), found
+
+    def ellipsoid(self, sigmas: float = 2.0) -> tuple[Vector, Quaternion]:
+        """The ellipsoid of the source's origin in the target, for a picture; its centre is the answer's translation.
+
+        Parameters
+        ----------
+        sigmas : float
+            Its size in standard deviations.
+
+        Returns
+        -------
+        ((a, b, c), (x, y, z, w))
+            The semi-axes in m, the shortest first, and the unit quaternion that turns x, y, z to them.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> error = Covariance.of(xyz=(0.1, 0.2, 0.3))
+        >>> _ = tree.insert(UncertainSample("map", "base", 0, Transform(), covariance=error))
+        >>> [round(axis, 6) for axis in tree.lookup("map", "base", covariance=True).ellipsoid()[0]]
+        [0.2, 0.4, 0.6]
+        """
+        values, vectors = np.linalg.eigh(self.covariance.matrix[:3, :3])
+        # Eigenvectors may be left-handed.
+        vectors[:, 0] *= np.linalg.det(vectors)
+        matrix = np.eye(4)
+        matrix[:3, :3] = vectors
+        a, b, c = (sigmas * math.sqrt(max(value, 0.0)) for value in values.tolist())
+        return (a, b, c), Transform.from_matrix(matrix).rotation
 
     def as_pose(self) -> PoseWithCovarianceStamped:
         """The pose of the source in the target as data with a covariance, for a message of ROS.
