@@ -107,7 +107,14 @@ _NAMES_IN = {
     "tree.history": ("Edge", "Outcome"),
     "tree.lookup": ("Hold", "Question"),
     "tree.tree": ("TransformTree",),
-    "uncertainty": ("JointAnswers", "Share", "UncertainTransform", "UncertainTransformArray", "joint"),
+    "uncertainty": (
+        "JointAnswers",
+        "Share",
+        "UncertainTransform",
+        "UncertainTransformArray",
+        "UncertainTwist",
+        "joint",
+    ),
     "waiting.live_tree": ("PendingLookup",),
     "which_kernel": ("kernel",),
 }

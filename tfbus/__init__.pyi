@@ -126,6 +126,7 @@ from tfbus.uncertainty import JointAnswers as JointAnswers
 from tfbus.uncertainty import Share as Share
 from tfbus.uncertainty import UncertainTransform as UncertainTransform
 from tfbus.uncertainty import UncertainTransformArray as UncertainTransformArray
+from tfbus.uncertainty import UncertainTwist as UncertainTwist
 from tfbus.uncertainty import joint as joint
 from tfbus.waiting.live_tree import PendingLookup as PendingLookup
 from tfbus.which_kernel import kernel as kernel

@@ -396,7 +396,7 @@ def test_outside_the_window_the_errors_are_those_of_lookup(frame: str, reference
 @pytest.mark.parametrize("at", [1.5, True, "now", None])
 def test_a_stamp_is_an_integer_or_latest(at: object) -> None:
     with pytest.raises(TypeError, match="a stamp is an int of nanoseconds"):
-        lines_of_two_trees().twist("body", "map", at)  # type: ignore[arg-type]
+        lines_of_two_trees().twist("body", "map", at)  # type: ignore[call-overload]
 
 
 @pytest.mark.parametrize(("early", "late"), [("axes", "body"), ("body", "axes")])

@@ -3,16 +3,19 @@
 import numpy as np
 import pytest
 from support.samples import moving, static
-from support.worlds import random_covariance, random_transform, sigma_of, unsure
+from support.worlds import disturbed, random_covariance, random_transform, root, sigma_of, unsure, white
 
 from tfbus import (
     SECOND,
     Covariance,
     FutureExtrapolationError,
     Hold,
+    Transform,
+    TransformStamped,
     TransformTree,
     UncertainSample,
 )
+from tfbus.geometry.covariance import Kind, lever_arm
 
 ERROR = Covariance.of(xyz=0.1, rpy=0.01)
 
@@ -123,3 +126,66 @@ def test_many_answers_without_errors_say_so(count: int) -> None:
     assert found.covariances.shape == (count, 6, 6)
     assert not found.covariances.any()
     assert found.exact == ((("a", "b"),) if count else ())
+
+
+@pytest.mark.parametrize("kind", ["independent", "drift", "constant"])
+@pytest.mark.parametrize("in_frame", [False, True])
+def test_a_twist_has_the_error_of_the_motion_between_its_samples(kind: Kind, in_frame: bool) -> None:
+    rng, worlds = np.random.default_rng(3), 2000
+    # The reference climbs an edge that moves, and the frame hangs on one that moves and on one that does not.
+    mount = random_transform(rng)
+    ends = {name: [random_transform(rng), random_transform(rng)] for name in ("eye", "base")}
+    errors, samples = {}, []
+    for child, poses in ends.items():
+        older = random_covariance(rng, 0.02, 0.01)
+        arm = lever_arm(np.subtract(poses[1].translation, poses[0].translation))
+        added = random_covariance(rng, 0.01, 0.005)
+        newer = arm @ older @ arm.T + added if kind == "drift" else older
+        first, other = white(rng, worlds, 12).reshape(worlds, 2, 6).swapaxes(0, 1)
+        before = first @ root(older).T
+        after = {
+            "drift": before @ arm.T + other @ root(added).T,
+            "constant": before,
+            "independent": other @ root(older).T,
+        }[kind]
+        errors[child] = before, after
+        for stamp, pose, matrix in zip((0, SECOND), poses, (older, newer), strict=True):
+            samples.append(UncertainSample("map", child, stamp, pose, covariance=Covariance(matrix), kind=kind))
+    fixed = random_covariance(rng, 0.01, 0.01)
+    samples.append(UncertainSample("base", "hand", 0, mount, static=True, covariance=Covariance(fixed)))
+    tree = TransformTree()
+    tree.insert_many(samples)
+    at, axes = SECOND // 4, "hand" if in_frame else "eye"
+    found = tree.twist("hand", "eye", at, expressed_in=axes, covariance=True)
+    assert found.exact == ()
+    assert (found.linear, found.angular) == (
+        tree.twist("hand", "eye", at, expressed_in=axes).linear,
+        tree.twist("hand", "eye", at, expressed_in=axes).angular,
+    )
+    mounts = disturbed(mount, rng.standard_normal((worlds, 6)) @ root(fixed).T)
+    moved = {
+        child: [disturbed(pose, error) for pose, error in zip(ends[child], errors[child], strict=True)]
+        for child in ends
+    }
+    twists = []
+    for world in range(worlds):
+        true = TransformTree()
+        for child in ends:
+            for stamp, drawn in zip((0, SECOND), moved[child], strict=True):
+                true.insert(TransformStamped("map", child, stamp, Transform.from_matrix(drawn[world])))
+        true.insert(TransformStamped("base", "hand", 0, Transform.from_matrix(mounts[world]), static=True))
+        twist = true.twist("hand", "eye", at, expressed_in=axes)
+        twists.append([*twist.linear, *twist.angular])
+    truth = np.cov(np.array(twists).T)
+    unit = np.sqrt(truth.diagonal())
+    assert np.sqrt(found.covariance.diagonal()) == pytest.approx(unit, rel=0.07)
+    assert found.covariance / np.outer(unit, unit) == pytest.approx(truth / np.outer(unit, unit), abs=0.12)
+
+
+def test_a_twist_names_the_edges_without_an_error_and_refuses_third_axes() -> None:
+    tree = TransformTree()
+    tree.insert_many([unsure("map", "base", 0), moving("map", "base", 10), static("base", "hand")])
+    assert tree.twist("hand", "map", 5, covariance=True).exact == (("map", "base"), ("base", "hand"))
+    assert not tree.twist("map", "map", 5, covariance=True).covariance.any()
+    with pytest.raises(ValueError, match="along the axes of 'map' or 'hand', not of 'base'"):
+        tree.twist("hand", "map", 5, expressed_in="base", covariance=True)

@@ -49,7 +49,9 @@ from tfbus.tree.lookup_many import OutOfRange, deskew, lookup_many
 from tfbus.tree.rendering import cell, counted, describe, to_dot, to_html, to_yaml
 from tfbus.tree.twist import twist, twist_many
 from tfbus.tree.uncertain import uncertain_answer, uncertain_many
+from tfbus.tree.uncertain_twist import uncertain_twist
 from tfbus.uncertainty.answers import UncertainTransform, UncertainTransformArray
+from tfbus.uncertainty.data import UncertainTwist
 from tfbus.which_kernel import plain_first
 
 
@@ -585,9 +587,37 @@ class TransformTree:
         policy = policy_of(tolerance, max_gap, extrapolate)
         return deskew(self._forest, cloud, target, fixed, out_of_range, policy)
 
+    @overload
     def twist(
-        self, frame: str, reference: str, at: AtLike = LATEST, *, expressed_in: str | None = None
-    ) -> TwistStamped:
+        self,
+        frame: str,
+        reference: str,
+        at: AtLike = ...,
+        *,
+        expressed_in: str | None = ...,
+        covariance: Literal[False] = ...,
+    ) -> TwistStamped: ...
+
+    @overload
+    def twist(
+        self,
+        frame: str,
+        reference: str,
+        at: AtLike = ...,
+        *,
+        expressed_in: str | None = ...,
+        covariance: Literal[True],
+    ) -> UncertainTwist: ...
+
+    def twist(
+        self,
+        frame: str,
+        reference: str,
+        at: AtLike = LATEST,
+        *,
+        expressed_in: str | None = None,
+        covariance: bool = False,
+    ) -> TwistStamped | UncertainTwist:
         """The velocity of `frame` in `reference`: the derivative of the interpolation of `lookup`.
 
         Parameters
@@ -597,6 +627,9 @@ class TransformTree:
             ns. `LATEST` is the newest stamp that every moving edge on the paths can answer.
         expressed_in : str, optional
             The frame along whose axes the velocities are given; by default `reference`.
+        covariance : bool
+            Whether the answer is an `UncertainTwist`, with the covariance of its error by those of the samples around
+            the stamp. The axes must be those of `reference` or of `frame`.
 
         Returns
         -------
@@ -611,6 +644,8 @@ class TransformTree:
         TransformLookupError
             As `lookup`; and `FutureExtrapolationError` at an edge's newest sample if it is the only one, or the only
             one with its parent.
+        ValueError
+            If a covariance is asked along the axes of a third frame.
 
         Notes
         -----
@@ -634,6 +669,13 @@ class TransformTree:
             at = as_stamp(at)
         self._forest.search(reference, frame)
         self._forest.search(axes, reference)
+        if covariance:
+            if axes not in (frame, reference):
+                raise ValueError(f"a covariance is along the axes of {reference!r} or {frame!r}, not of {axes!r}")
+            with self._forest.lock:
+                found = uncertain_twist(self._forest, frame, reference, at, axes != reference)
+            stamp, linear, angular, matrix, exact = found
+            return UncertainTwist(axes, stamp, linear, angular, matrix, tuple(exact))
         with self._forest.lock:
             stamp, linear, angular = twist(self._forest, frame, reference, at, axes)
         return TwistStamped(axes, stamp, linear, angular)

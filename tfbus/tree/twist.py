@@ -46,7 +46,9 @@ def twist(forest: Forest, frame: str, reference: str, at: At, axes: str) -> tupl
     find(forest, reference, frame, stamp, None)
     turn = find(forest, axes, reference, stamp, None)[1][3:]
     path = forest.find_path(reference, frame, stamp)
-    linear, angular = _motion(*([_motion_of(step, stamp) for step in steps] for steps in (path.up, path.down)))
+    _, linear, angular = motion_of_path(
+        *([_motion_of(step, stamp) for step in steps] for steps in (path.up, path.down))
+    )
     return stamp, rotate(turn, *linear), rotate(turn, *angular)
 
 
@@ -70,7 +72,8 @@ def twist_many(
                 covered = path.covered(here)
                 at = np.arange(len(stamps))[places][covered]
                 up, down = ([_motions_of(step, stamps[at]) for step in steps] for steps in (path.up, path.down))
-                for row, column in enumerate(sum(_motion(up, down), ())):
+                _, linear, angular = motion_of_path(up, down)
+                for row, column in enumerate(linear + angular):
                     found[row, at] = column
         turn = (*turns.columns()[3:],)
         found = np.stack((*rotate(turn, *found[:3]), *rotate(turn, *found[3:])))
@@ -104,8 +107,8 @@ def _common_stamp(forest: Forest, frame: str, reference: str, axes: str) -> int:
     return common
 
 
-def _motion(up: Iterable[Motion], down: Iterable[Motion]) -> tuple[Vectors, Vectors]:
-    """The linear and angular velocity of a path's source, seen from its target, by the motions of its edges.
+def motion_of_path(up: Iterable[Motion], down: Iterable[Motion]) -> Motion:
+    """The pose and the velocity of a path's source, seen from its target, by the motions of its edges.
 
     Both are computed in the common ancestor. The target's own motion is subtracted (Craig, "Introduction to Robotics",
     3rd edition, section 5.3), and the difference is rotated into the target's axes.
@@ -114,8 +117,8 @@ def _motion(up: Iterable[Motion], down: Iterable[Motion]) -> tuple[Vectors, Vect
     arm = _difference(above.row[:3], below.row[:3])
     linear = _difference(_difference(above.linear, below.linear), _cross(below.angular, arm))
     angular = _difference(above.angular, below.angular)
-    turn = invert(below.row)[3:]
-    return rotate(turn, *linear), rotate(turn, *angular)
+    back = invert(below.row)
+    return Motion(compose(back, above.row), rotate(back[3:], *linear), rotate(back[3:], *angular))
 
 
 def _climb(edges: Iterable[Motion]) -> Motion:
@@ -144,7 +147,12 @@ def _motion_of(edge: Step, at: int) -> Motion:
         return Motion(row, ZERO, ZERO)
     stamp, before = edge.sample(i - 1)
     until, after = edge.sample(i)
-    rate = SECOND / (until - stamp)
+    return motion_between(row, before, after, until - stamp)
+
+
+def motion_between(row: Row, before: Row, after: Row, duration: int) -> Motion:
+    """The motion of an edge that is at `row` between two samples, by the time between them in ns."""
+    rate = SECOND / duration
     x, y, z = _difference(after[:3], before[:3])
     return Motion(row, (x * rate, y * rate, z * rate), _turn_rate(before[3:], after[3:], rate))
 

@@ -75,11 +75,11 @@ def _links(forest: Forest, target: str, source: str, at: int, policy: Policy | N
     for edge, climbs in edges_of(forest.find_path(target, source, at), forest):
         stamp = at if edge.static or policy is None else read_stamp(edge, at, policy).stamp
         row = edge.row_at(stamp)
-        links.append(Link(edge.parent_at(stamp), edge.child, row, climbs, _error(edge, stamp, row[:3])))
+        links.append(Link(edge.parent_at(stamp), edge.child, row, climbs, error_at(edge, stamp, row[:3])))
     return links
 
 
-def _error(edge: FrameHistory, at: int, place: Vector) -> EdgeError | None:
+def error_at(edge: FrameHistory, at: int, place: Vector) -> EdgeError | None:
     """The error of an edge that covers a stamp; None if a sample that counts there has no covariance."""
     beliefs = edge.beliefs
     if beliefs is None:

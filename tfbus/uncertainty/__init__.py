@@ -6,5 +6,6 @@ made of.
 """
 
 from tfbus.uncertainty.answers import JointAnswers, Share, UncertainTransform, UncertainTransformArray, joint
+from tfbus.uncertainty.data import UncertainTwist
 
-__all__ = ["JointAnswers", "Share", "UncertainTransform", "UncertainTransformArray", "joint"]
+__all__ = ["JointAnswers", "Share", "UncertainTransform", "UncertainTransformArray", "UncertainTwist", "joint"]

@@ -1,5 +1,6 @@
 """Poses and points in another frame, with their own error and that of the transform."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,34 @@ from tfbus.data import (
     PointWithCovarianceStamped,
     PoseStamped,
     PoseWithCovarianceStamped,
+    TwistWithCovarianceStamped,
     do_transform,
 )
 from tfbus.geometry.covariance import Matrix, lever_arm
 from tfbus.uncertainty.answers import UncertainTransform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UncertainTwist(TwistWithCovarianceStamped):
+    """A velocity with its covariance, as `TransformTree.twist` gives it with ``covariance=True``.
+
+    Attributes
+    ----------
+    exact : tuple of (str, str)
+        The edges, as (parent, child), that gave no covariance, and count as exact.
+
+    Examples
+    --------
+    >>> tree = TransformTree()
+    >>> for second, sigma in ((0, 0.0), (1, 0.1)):
+    ...     stamp, error = second * SECOND, Covariance.of(xyz=sigma)
+    ...     _ = tree.insert(UncertainSample("odom", "base", stamp, Transform(), covariance=error, kind="drift"))
+    >>> found = tree.twist("base", "odom", covariance=True)
+    >>> found.covariance[0, 0].round(9).item(), found.exact
+    (0.01, ())
+    """
+
+    exact: tuple[tuple[str, str], ...] = ()
 
 
 def with_error_of(data: Any, transform: UncertainTransform) -> Any:
