@@ -18,6 +18,7 @@ from docutils.nodes import Element, TextElement
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
+from sphinx.pycode import ModuleAnalyzer
 
 from tfbus.cli.application import COMMANDS, application
 
@@ -53,6 +54,7 @@ nitpick_ignore = [
     ("py:class", "contextlib.AbstractContextManager"),
     ("py:class", "datetime.datetime"),
     ("py:class", "matplotlib.figure.Figure"),
+    ("py:class", "numpy.random._generator.Generator"),
     ("py:class", "os.PathLike"),
     ("py:class", "pathlib.Path"),
 ]
@@ -259,6 +261,18 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: Tex
         found: Element | None = domain.resolve_xref(env, node["refdoc"], app.builder, "obj", public, node, content)
         return found
     return content if target in WORDS else None
+
+
+def analyze(self: ModuleAnalyzer) -> None:
+    """Read a module without the overloads of lookups, which say less than the one signature that has all arguments."""
+    read_with_overloads(self)
+    self.overloads = {
+        name: found for name, found in self.overloads.items() if not any("covariance" in s.parameters for s in found)
+    }
+
+
+read_with_overloads = ModuleAnalyzer.analyze
+ModuleAnalyzer.analyze = analyze  # type: ignore[method-assign]
 
 
 def setup(app: Sphinx) -> None:
