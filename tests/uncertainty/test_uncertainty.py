@@ -103,20 +103,29 @@ def difference(found: Matrix, truth: Matrix) -> float:
     return float(np.linalg.norm((found - truth) / unit) / np.linalg.norm(truth / unit))
 
 
+def difference_of(seed: int, rpy: float, limit: float) -> tuple[UncertainTransform, float]:
+    """The answer across a random tree, and its difference from Monte Carlo, with more draws if it is above a limit."""
+    off = 0.0
+    for draws in (1000, 30_000):
+        found, truth = random_chain(np.random.default_rng(seed), rpy, draws)
+        off = difference(found.covariance.matrix, truth)
+        if off < limit or not found.linear:
+            break
+    return found, off
+
+
 @pytest.mark.parametrize("trees", [25, pytest.param(TREES, marks=pytest.mark.thorough)])
 def test_random_trees_agree_with_monte_carlo_up_to_a_twentieth_of_a_radian(trees: int) -> None:
     for seed in range(trees):
-        found, truth = random_chain(np.random.default_rng(seed), 0.05)
-        assert difference(found.covariance.matrix, truth) < 0.03, seed
+        assert difference_of(seed, 0.05, 0.03)[1] < 0.03, seed
 
 
 @pytest.mark.parametrize("trees", [25, pytest.param(TREES, marks=pytest.mark.thorough)])
 def test_beyond_first_order_an_answer_says_that_it_is_not_linear(trees: int) -> None:
     told = 0
     for seed in range(trees):
-        rng = np.random.default_rng(seed)
-        found, truth = random_chain(rng, rng.uniform(0.05, 0.4))
-        if difference(found.covariance.matrix, truth) > 0.05:
+        found, off = difference_of(seed, np.random.default_rng(seed).uniform(0.05, 0.4), 0.05)
+        if off > 0.05:
             told += 1
             assert not found.linear, seed
     assert told > trees // 5

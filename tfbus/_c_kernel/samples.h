@@ -215,7 +215,11 @@ knows_more(const Sample *sample)
     if (kind != met_kind) {
         PyObject *before = met_kind, *is_plain = PyObject_GetAttrString(kind, "_is_plain");
         if (is_plain == NULL) {
+            const int has_none = PyErr_ExceptionMatches(PyExc_AttributeError);
             PyErr_Clear();
+            if (!has_none) {
+                return 1;
+            }
         }
         met_knows_more = is_plain == Py_False;
         met_kind = Py_NewRef(kind);

@@ -3,6 +3,9 @@
 The kernel stores the moving samples, and appends a sample that only continues the others, as nearly all do. Every other
 case is decided here: late samples, changes of the parent, static samples. Every sample may name its own parent, because
 a frame may be reparented; parents and authorities are stored as runs of samples with the same one.
+
+A sample may have a covariance. It is kept beside the samples, by its stamp, and only for frames that have some. The
+kernel leaves such a sample to this module, and never reads a covariance. So a plain sample costs nothing.
 """
 
 from bisect import bisect_right
