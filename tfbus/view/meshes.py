@@ -23,6 +23,7 @@ import trimesh
 
 from tfbus.plain import printable
 from tfbus.robot.model import Box, Cylinder, Mesh, Shape, Sphere, Visual
+from tfbus.view.session import ROBOT, framed
 
 MAX_BYTES = 67_108_864
 """The greatest size in bytes of a mesh file and all files that it refers to, unpacked."""
@@ -133,6 +134,28 @@ def solids_of(visuals: Sequence[Visual], files: MeshFiles) -> list[Solid]:
             "%d mesh files are missing, boxes stand for them: %s", len(files.missing), printable(f"{name} ({why})")
         )
     return solids
+
+
+def robot_message(solids: Sequence[Solid]) -> bytes:
+    """The shapes of a robot for the browsers, each mesh once; empty if there are none."""
+    meshes = {solid.key: solid.triangles for solid in solids}
+    places = {key: place for place, key in enumerate(meshes)}
+    header = {
+        "meshes": [{"vertices": len(each.vertices), "faces": len(each.faces)} for each in meshes.values()],
+        "solids": [
+            {
+                "mesh": places[solid.key],
+                "link": solid.visual.link,
+                "xyz": solid.visual.origin.translation,
+                "xyzw": solid.visual.origin.rotation,
+                "scale": solid.scale,
+                "colour": solid.colour,
+                "opacity": solid.opacity,
+            }
+            for solid in solids
+        ],
+    }
+    return framed(ROBOT, header, *(array for each in meshes.values() for array in each)) if solids else b""
 
 
 def _solid(visual: Visual, files: MeshFiles) -> Solid:
