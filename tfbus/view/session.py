@@ -242,11 +242,10 @@ def trail(tree: TransformTree, fixed: str, frame: str, at: int | None, duration:
     """
     nothing = np.empty((0, 3), np.float32)
     try:
-        if at is None:
-            newest = tree.lookup(fixed, frame, LATEST)
-            if newest.static:
-                return nothing
-            at = newest.stamp
+        newest = tree.lookup(fixed, frame, LATEST)
+        if newest.static:
+            return nothing
+        at = newest.stamp if at is None else at
         stamps = np.linspace(at - from_seconds(duration), at, SAMPLES).astype(np.int64)
         stamps[-1] = at
         found = tree.lookup_many(fixed, frame, stamps, out_of_range="nan")
@@ -450,7 +449,9 @@ class Session:
         self._poses_of_points: dict[str, tuple[Points, str, Row]] = {}
         self._drawn_at: int | None = None
         self._texts_due: int | None = None
-        self._counted: tuple[object, str | None, str | None] = (None, None, None)
+        self._fixed: str | None = None
+        self._structure: object = None
+        self._named: object = None
         self._others: list[str] = []
         self._other_codes: list[int] = []
         self._show(page.tree)
@@ -460,9 +461,8 @@ class Session:
 
     def _show(self, tree: TransformTree) -> None:
         self._tree = tree
-        self._root: str | None = None
         self._reader = PoseReader(forest_of(tree))
-        self._counted = (None, None, None)
+        self._structure = self._named = None
 
     # What a person does
 
@@ -515,6 +515,7 @@ class Session:
 
     def _choose_fixed(self, frame: Any) -> None:
         self._chosen = self._known(frame)
+        self._structure = None
 
     def _select(self, frame: Any) -> None:
         self._selected = self._known(frame)
@@ -593,15 +594,6 @@ class Session:
 
     # What the browser is sent
 
-    @property
-    def fixed(self) -> str | None:
-        """The fixed frame; None while there are no frames."""
-        if self._chosen is not None:
-            return self._chosen
-        if self._root is None or self._root not in self._tree or self._tree.parent(self._root) is not None:
-            self._root = largest_root(forest_of(self._tree))
-        return self._root
-
     def picture(self, now: int, elapsed: int) -> list[Message]:
         """The messages that bring the browser up to date.
 
@@ -619,14 +611,27 @@ class Session:
         if with_texts:
             self._texts_due = elapsed + _TEXTS_EVERY
         self._follow_edits()
+        self._find_fixed()
         then = now if stamp is None else stamp
         return [
             *self._greeting(),
             *self._frames(LATEST if stamp is None else stamp, then, with_texts),
             *self._trail_lines(stamp),
-            *(self._times(now) if with_texts or stamp is not None else ()),
+            # Changed or not, it is the sign of life that the browser waits for.
+            *([self._time(now)] if with_texts or self.timeline.playing else ()),
             *(self._selection(stamp, then) if with_texts else ()),
         ]
+
+    def _find_fixed(self) -> None:
+        forest = forest_of(self._tree)
+        with forest.lock:
+            structure = forest.structure, len(forest.frames)
+        if self._chosen is not None:
+            self._fixed = self._chosen
+        elif structure != self._structure or self._fixed is None:
+            # Only then a larger tree may have come: all frames are counted for that.
+            self._fixed = largest_root(forest)
+        self._structure = structure
 
     def _if_new(self, kind: str, message: Message) -> Iterator[Message]:
         if self._sent.get(kind) != message:
@@ -647,21 +652,14 @@ class Session:
 
     def _frames(self, at: int | Latest, then: int, with_texts: bool) -> Iterator[Message]:
         """The frames if they are others, their states if those have changed, and the poses."""
-        fixed, poses = self.fixed, None
+        fixed, poses = self._fixed, None
         if fixed is not None:
             with suppress(UnknownFrameError):
                 poses = self._reader.read(fixed, at)
-        key = self._reader.topology if poses is not None else self._tree.frames(), fixed, self._chosen
-        if key[0] is not self._counted[0] or key[1:] != self._counted[1:]:
-            # A larger tree may have come; all frames are counted for that, so not for each picture.
-            if key[0] is not self._counted[0] and self._chosen is None and self._root is not None:
-                self._root = None
-                if self.fixed != fixed:
-                    self._counted = key
-                    yield from self._frames(at, then, with_texts)
-                    return
-            self._counted = key
-            yield from self._name_frames(poses, fixed, at)
+        named = self._reader.topology, self._structure, fixed, self._chosen
+        if named != self._named:
+            self._named = named
+            yield from self._name_frames(poses, at)
             with_texts = True
         if with_texts:
             self._other_codes = [self._code_of(frame, at, then) for frame in self._others]
@@ -686,7 +684,7 @@ class Session:
             self._poses_of_points.pop(name, None)
         yield from self._if_new("poses", struct.pack("<B3x", POSES) + rows.tobytes())
 
-    def _name_frames(self, poses: Poses | None, fixed: str | None, at: int | Latest) -> Iterator[Message]:
+    def _name_frames(self, poses: Poses | None, at: int | Latest) -> Iterator[Message]:
         connected = () if poses is None else poses.frames
         names = self._tree.frames()
         self._others = sorted(set(names).difference(connected))
@@ -698,7 +696,12 @@ class Session:
                 history = forest.frames.get(frame)
                 parents.append(-1 if history is None else places.get(_parent(history, at), -1))
         yield from self._text(
-            "frames", names=list(places), parents=parents, fixed=fixed, chosen_fixed=self._chosen, waiting=not places
+            "frames",
+            names=list(places),
+            parents=parents,
+            fixed=self._fixed,
+            chosen_fixed=self._chosen,
+            waiting=not places,
         )
 
     def _codes(self, poses: Poses, then: int) -> npt.NDArray[np.intp]:
@@ -741,7 +744,7 @@ class Session:
     def _trail_lines(self, stamp: int | None) -> Iterator[Message]:
         if not self._trails and "trails" not in self._sent:
             return
-        fixed = self.fixed
+        fixed = self._fixed
         found = [
             (frame, seconds, trail(self._tree, fixed, frame, stamp, seconds))
             for frame, seconds in self._trails.items()
@@ -750,17 +753,19 @@ class Session:
         header = [{"frame": frame, "count": len(points), "seconds": seconds} for frame, seconds, points in found]
         yield from self._if_new("trails", framed(TRAILS, {"trails": header}, *(points for _, _, points in found)))
 
-    def _times(self, now: int) -> Iterator[Message]:
+    def _time(self, now: int) -> Message:
         line = self.timeline
         if line.stamp is None:
             mode, at, span = "live", now, span_of(forest_of(self._tree))
         else:
             mode, at, span = "playing" if line.playing else "paused", line.stamp, (line.start, line.end)
         start, end = (None, None) if span is None else map(str, span)
-        yield from self._text("time", mode=mode, at=str(at), start=start, end=end, speed=line.speed)
+        return json.dumps(
+            {"type": "time", "mode": mode, "at": str(at), "start": start, "end": end, "speed": line.speed}
+        )
 
     def _selection(self, stamp: int | None, then: int) -> Iterator[Message]:
-        frame, fixed, at = self._selected, self.fixed, LATEST if stamp is None else stamp
+        frame, fixed, at = self._selected, self._fixed, LATEST if stamp is None else stamp
         facts: dict[str, str] = {}
         chain: list[str] = []
         parent = own = None

@@ -8,6 +8,7 @@ slow to read, no picture is made for it; the next one is of that moment. Threads
 import json
 import logging
 import os
+import shlex
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,7 +22,6 @@ import anyio.abc
 import anyio.to_thread
 import numpy as np
 
-import tfbus
 from tfbus._aio.task_groups import close_task_group
 from tfbus._aio.web_door import WebDoor
 from tfbus._aio.web_server import WebServer
@@ -196,7 +196,7 @@ class View(AsyncOnly):
         self._period = 1.0 / rate
         self._stale_after = as_duration(stale_after, "stale_after")
         self._save = None if save is None else Path(save).absolute()
-        hello = {"version": tfbus.__version__, "title": title, "save": save and str(self._save)}
+        hello = {"title": title, "save": save and str(self._save)}
         self._page = Page(buffer.tree, fixed, trails, live, self._stale_after, edit, hello)
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._viewers: set[_Viewer] = set()
@@ -387,12 +387,14 @@ class View(AsyncOnly):
         return {"path": str(self._save), "frames": [sample.child for sample in samples]}
 
     def _greet(self) -> None:
-        """Tell the browsers which domain is shown, and who is heard there."""
+        """Tell the browsers which domain is shown, who is heard there, and how a frame is sent to it."""
         links = [each for each in self.bus._entered if isinstance(each, _HasPeers)]
+        named = [link.domain for link in links if isinstance(link.domain, str)]
+        option = f" --domain {shlex.quote(named[0])}" if named and named[0] != "tf" else ""
         self._page.hello |= {
             "where": " and ".join(f"domain {link.domain!r}" for link in links),
             "hears": counted(sum(len(link.peers) for link in links), "peer") if links else "",
-            "send": "tfbus static map base 1 0 0" if self._page.live else "",
+            "send": f"tfbus static map base --xyz 1 0 0{option}" if named and self._page.live else "",
         }
 
     def _change(self) -> None:
