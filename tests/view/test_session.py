@@ -154,6 +154,15 @@ def test_time_stands_still_on_a_copy_of_the_history_until_it_goes_live_again() -
     assert browser.time[0] == "live"
 
 
+def test_time_stands_still_where_all_frames_have_a_pose_that_are_not_stale() -> None:
+    tree = tree_of(*(moving("map", f"{age}", (100 - age) * SECOND // 10) for age in (0, 1, 2, 11)))
+    browser = Browser(tree, stale_after=1.0)
+    assert browser.do("pause").time == ("paused", 9.8)
+    assert browser.said["time"]["end"] == str(10 * SECOND)
+    assert browser.do("play").time == ("playing", 8.9)
+    assert browser.do("end").time == ("paused", 9.8)
+
+
 def test_a_tree_without_moving_frames_stays_live() -> None:
     browser = Browser(tree_of(static("map", "a", 1.0)))
     for order in ({"name": "pause"}, {"name": "play"}, {"name": "step", "forward": True}, {"name": "home"}):

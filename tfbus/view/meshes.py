@@ -39,8 +39,11 @@ _SPACE[list(b' \t\r\n\v\f,;/[]{}:<>="')] = True
 _CHUNK = 1_048_576
 _PLACEHOLDER = 0.05
 """In m: the side of the box that stands for a missing mesh."""
-_PLACEHOLDER_COLOUR = (204, 121, 167)
+_PLACEHOLDER_COLOUR = (150, 150, 150)
+_PLACEHOLDER_OPACITY = 0.35
 _NO_COLOUR = (190, 190, 190)
+# It tells of each texture that is not decoded, and without a handler Python would print that.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 class Triangles(NamedTuple):
@@ -166,7 +169,9 @@ def _solid(visual: Visual, files: MeshFiles) -> Solid:
         found = files.read(shape.filename)
         if found is None:
             side = _PLACEHOLDER
-            return Solid(visual, "box", _unit(Box((1, 1, 1))), (side, side, side), _PLACEHOLDER_COLOUR, 0.6)
+            return Solid(
+                visual, "box", _unit(Box((1, 1, 1))), (side, side, side), _PLACEHOLDER_COLOUR, _PLACEHOLDER_OPACITY
+            )
         (triangles, own), key, scale = found, f"mesh {shape.filename}", shape.scale
     elif isinstance(shape, Box):
         triangles, key, scale = _unit(shape), "box", shape.size

@@ -79,6 +79,8 @@ class Timeline:
         The chosen stamp, in ns; None while the page is live.
     start, end : int
         The span in which a stamp can be chosen, in ns.
+    last : int
+        The newest stamp of it at which frames have poses, in ns.
     playing : bool
         Whether the chosen stamp runs.
     speed : float
@@ -89,12 +91,14 @@ class Timeline:
         self.stamp: int | None = None
         self.start: int = 0
         self.end: int = 0
+        self.last: int = 0
         self.playing: bool = False
         self.speed: float = 1.0
 
-    def choose(self, stamp: int, span: tuple[int, int]) -> None:
-        """Stand still at a stamp of a span, both in ns."""
+    def choose(self, stamp: int, span: tuple[int, int], last: int) -> None:
+        """Stand still at a stamp of a span, all in ns."""
         self.start, self.end = span
+        self.last = last
         self.stamp = min(max(stamp, self.start), self.end)
         self.playing = False
 
@@ -105,10 +109,10 @@ class Timeline:
             self.stamp = min(max(stamp, self.start), self.end)
 
     def play(self) -> None:
-        """Run from the chosen stamp, or from the start if the chosen stamp is the end; while live, nothing happens."""
+        """Run from the chosen stamp, or from the start if that is the last one; while live, nothing happens."""
         if self.stamp is not None:
             self.playing = True
-            if self.stamp >= self.end:
+            if self.stamp >= self.last:
                 self.stamp = self.start
 
     def advance(self, elapsed: float) -> None:
@@ -457,7 +461,7 @@ class Session:
         self._show(page.tree)
         if not page.live:
             start, end = span_of(forest_of(page.tree)) or (0, 0)
-            self.timeline.choose(start, (start, end))
+            self.timeline.choose(start, (start, end), end)
 
     def _show(self, tree: TransformTree) -> None:
         self._tree = tree
@@ -490,11 +494,16 @@ class Session:
         return self.timeline.stamp is None and order.name in _STOPPING
 
     def hold(self, history: TransformTree) -> None:
-        """Stand still at the newest stamp of a copy of the tree, because the live tree forgets old samples."""
+        """Stand still on a copy of the tree, because the live tree forgets old samples.
+
+        The stamp is the newest one that all frames cover which are not stale.
+        """
         span = span_of(forest_of(history))
         if span is not None:
+            newest = [frame.newest for frame in forest_of(history).frames.values() if frame.newest is not None]
+            last = min(each for each in newest if span[1] - each <= self._page.stale_after)
             self._show(history)
-            self.timeline.choose(span[1], span)
+            self.timeline.choose(last, span, last)
 
     def do(self, order: Order) -> Edit | Save | None:
         """Carry out an order; an `Edit` or a `Save` is for the program.
@@ -569,7 +578,7 @@ class Session:
 
     def _end(self) -> None:
         self._pause()
-        self.timeline.seek(self.timeline.end)
+        self.timeline.seek(self.timeline.last)
 
     def _edit(self, frame: Any, xyz: Any, xyzw: Any) -> Edit:
         if frame not in self._page.edit:

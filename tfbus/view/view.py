@@ -316,6 +316,7 @@ class View(AsyncOnly):
             text = isinstance(self._urdf, str) and "<" in self._urdf
             files = MeshFiles(self._package_paths, Path() if text else Path(self._urdf).parent)
             self._page.robot = robot_message(solids_of(read_visuals(self._urdf), files))
+            self._page.hello["missing"] = len(files.missing)
 
     async def _serve(self, socket: WebSocket) -> None:
         """Show the page in one browser, until it is gone."""
