@@ -222,7 +222,7 @@ def test_the_facts_of_a_selection_are_its_pose_and_the_edge_above_it() -> None:
 
 def test_a_frame_without_a_pose_says_why_and_keeps_the_other_facts() -> None:
     browser = Browser(tree_of(*over("map", "a", (0, SECOND)), *over("map", "b", (0, 9)), static("zoo", "c"), keep=None))
-    browser.do("select", frame="b").do("end")
+    browser.do("select", frame="b").do("seek", ns=str(SECOND))
     assert "short" in browser.facts["pose"]
     assert browser.facts["parent"] == "map"
     assert "different trees" in browser.do("select", frame="c").facts["pose"]
