@@ -89,6 +89,9 @@ def test_gaps_are_drawn_as_a_row_of_strips_a_frame_and_as_histograms_of_periods_
     assert bars(delays) == 5
     assert (strips.get_xlabel(), strips.get_ylim()) == ("time from the start [s]", (1.5, -0.5))
     assert strips.get_title() == "heard (static: dotted)"
+    many = plot_gaps({"base": heard(10, 11), **{f"mount{i}": heard(static=True) for i in range(20)}}).axes[0]
+    assert [label.get_text() for label in many.get_yticklabels()] == ["base"]
+    assert many.get_title() == "heard (20 static frames: not drawn)"
     assert [np.asarray(line.get_ydata()).tolist() for line in strips.lines] == [[0, 0], [0, 0], [1, 1]]
     for axes, least, most in ((periods, 1_000.0, 8_000.0), (delays, 500.0, 500.0)):
         assert (axes.get_ylabel(), axes.get_yscale()) == ("samples", "log")
@@ -138,7 +141,7 @@ def test_several_frames_and_recordings_have_lines_and_names_of_their_own() -> No
     lines = figure.axes[0].lines
     assert [line.get_label() for line in lines] == ["a, first", "b, first", "a, second", "b, second"]
     assert len({line.get_color() for line in lines}) == 4
-    assert figure.get_suptitle() == "in map"
+    assert figure.axes[0].get_title(loc="left") == "Poses in map"
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [str(line.get_label()) for line in lines]
 
 

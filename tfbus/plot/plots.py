@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator, MultipleLocator
+from matplotlib.ticker import MaxNLocator, MultipleLocator, NullFormatter, StrMethodFormatter
 
 from tfbus.analysis.compare import Comparison
 from tfbus.plain import printable
@@ -247,6 +247,7 @@ def read_reception(messages: Iterable[RecordedMessage]) -> dict[str, Reception]:
 GAP = 3.0
 """A pause is a gap if it is longer than the usual period of its frame by this factor."""
 _BINS = 60
+_MANY_FRAMES = 20
 
 
 def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None, *, recording: str = "") -> Figure:
@@ -265,7 +266,8 @@ def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None, 
     -------
     matplotlib.figure.Figure
         With three axes: the strips, the periods and the delays. A strip has a break where a frame was silent for more
-        than ``GAP`` times its median period.
+        than ``GAP`` times its median period. Of more than 20 frames, the title counts the static ones, and
+        only the moving ones have strips.
 
     Raises
     ------
@@ -274,7 +276,11 @@ def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None, 
     """
     if not reception:
         raise ValueError("there is no frame to draw")
-    frames = list(reception.values())
+    drawn = reception
+    if len(reception) > _MANY_FRAMES:
+        drawn = {name: frame for name, frame in reception.items() if not frame.static} or reception
+    left_out = len(reception) - len(drawn)
+    frames = list(drawn.values())
     result = new_figure(figure, 11.0, 3.0 + 0.2 * len(frames))
     places = result.subplot_mosaic([["strips", "periods"], ["strips", "delays"]], width_ratios=[3, 1.3])
     arrivals = [frame.received for frame in frames if len(frame.received)]
@@ -292,10 +298,10 @@ def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None, 
                 linewidth=5,
                 solid_capstyle="butt",
             )
-    strips.set_yticks(range(len(frames)), [shown(name) for name in reception], fontsize=7)
+    strips.set_yticks(range(len(frames)), [shown(name) for name in drawn], fontsize=7)
     strips.set_ylim(len(frames) - 0.5, -0.5)
     strips.set_xlabel("time from the start [s]")
-    strips.set_title("heard (static: dotted)")
+    strips.set_title(f"heard ({left_out} static frames: not drawn)" if left_out else "heard (static: dotted)")
     strips.grid(axis="x", alpha=0.3)
     _histogram(places["periods"], np.concatenate([frame.periods for frame in frames]), "period [ms]")
     _histogram(places["delays"], np.concatenate([frame.delays for frame in frames]), "delay [ms]")
@@ -320,6 +326,9 @@ def spans_heard(frame: Reception) -> list[tuple[int, int]]:
 def _histogram(axes: Axes, seconds: Floats, name: str) -> None:
     axes.hist(seconds * 1_000.0, bins=_BINS, color=COLOURS[0])
     axes.set_yscale("log", nonpositive="clip")
+    axes.set_ylim(bottom=0.8)
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel(name)
     axes.set_ylabel("samples")
     axes.grid(alpha=0.3)
@@ -431,7 +440,7 @@ def plot_transforms(
         result.align_ylabels(axes[:, column])
     for row in range(3):
         axes[row, 1].yaxis.set_major_locator(AngleLocator())
-    result.suptitle(f"in {shown(target)}")
+    axes[0, 0].set_title(f"Poses in {shown(target)}", loc="left")
     write_corner(axes[0, 1], recording, drawn[0][1].start)
     result.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=min(len(drawn), 4))
     return result

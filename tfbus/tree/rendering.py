@@ -117,6 +117,10 @@ def _stacked(edges: list[Edge], indent: str) -> list[tuple[Edge, str, str]]:
     return rows[::-1]
 
 
+_WIDEST_TREE = 15
+"""The most edges of a tree that is drawn downwards."""
+
+
 def to_dot(edges: Sequence[Edge], now: int | None = None, delays: Mapping[str, float] | None = None) -> str:
     """The edges in Graphviz's language; static ones are dashed.
 
@@ -124,7 +128,8 @@ def to_dot(edges: Sequence[Edge], now: int | None = None, delays: Mapping[str, f
     ----------
     edges : sequence of Edge
     now : int, optional
-        With it, each edge has the colour of its state at this stamp (ns), and its age and span in the label.
+        With it, each edge has the colour of its state at this stamp (ns), and its age and span in the label. A tree of
+        many frames grows to the right, so that it is not many times as wide as high.
     delays : mapping of str to float, optional
         By child, the mean time in s from the stamp of a sample to its arrival; shown in the label.
     """
@@ -134,6 +139,8 @@ def to_dot(edges: Sequence[Edge], now: int | None = None, delays: Mapping[str, f
             '    node [shape=box, style=rounded, fontname="Helvetica", fontsize=11, height=0.3];',
             '    edge [fontname="Helvetica", fontsize=9];',
         ]
+        if len(edges) > _WIDEST_TREE:
+            lines.append("    rankdir=LR; nodesep=0.3; ranksep=0.2;")
     for edge in edges:
         known = {"rate": _rate(edge)} if now is None else facts(edge, now)
         known["authority"] = edge.authority

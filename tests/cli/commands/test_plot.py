@@ -41,7 +41,7 @@ def texts_of(svg: Path) -> str:
 @pytest.mark.parametrize(
     ("options", "texts"),
     [
-        (("map", "base"), ["in map", "x [m]", "yaw [deg]", "base"]),
+        (("map", "base"), ["Poses in map", "x [m]", "yaw [deg]", "base"]),
         (("map", "base", "--path"), ["x in map [m]", "base"]),
         (("map", "base", "--3d"), ["z in map [m]"]),
         pytest.param(("--gaps", "base"), ["period [ms]", "base"], marks=pytest.mark.thorough),
