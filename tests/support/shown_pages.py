@@ -1,4 +1,4 @@
-"""What a browser knows of a live page, from the messages of a session or of a websocket."""
+"""The knowledge of a browser about a live page, from the messages of a session or of a websocket."""
 
 import json
 import struct

@@ -1,4 +1,4 @@
-"""The model of the page: what its browsers share, and what each of them sees.
+"""The model of the page: the part that its browsers share, and the part that is of each browser.
 
 A `Session` belongs to one browser. It takes the orders of a person (`read`, `do`), and `picture` gives the messages
 that bring the browser up to date: texts of JSON, and bytes. It knows no socket and no event loop, and repeats no
@@ -330,7 +330,7 @@ class Save(NamedTuple):
 
 
 class Order(NamedTuple):
-    """What a person does on the page: a name, and its values, which are not checked yet."""
+    """An action of a person on the page: its name, and its values, which are not checked yet."""
 
     name: str
     values: dict[str, Any]
@@ -340,7 +340,7 @@ _PEER = re.compile("[0-9a-f]{32}")
 
 
 class Page:
-    """What all browsers share.
+    """The part of the page that all browsers share.
 
     Parameters
     ----------
@@ -430,7 +430,7 @@ def _placed(tree: TransformTree, frame: str) -> Edit | None:
 
 
 class Session:
-    """What one browser sees: its selection, its time, its fixed frame, its trails.
+    """The part of the page that is of one browser: its selection, its time, its fixed frame, its trails.
 
     Parameters
     ----------
@@ -468,7 +468,7 @@ class Session:
         self._reader = PoseReader(forest_of(tree))
         self._structure = self._named = None
 
-    # What a person does
+    # The orders of a person
 
     def read(self, text: Message) -> Order:
         """The order in a message of a browser.
@@ -601,7 +601,7 @@ class Session:
             raise ValueError(f"no frame is called {reprlib.repr(frame)}")
         return frame
 
-    # What the browser is sent
+    # The messages for the browser
 
     def picture(self, now: int, elapsed: int) -> list[Message]:
         """The messages that bring the browser up to date.

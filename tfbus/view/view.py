@@ -112,7 +112,7 @@ class View(AsyncOnly):
         The port of the page; if it is taken, the next free one; 0 for any.
     host : str
         The address to listen at. By default, only programs on this machine can connect; each program that can connect
-        sees the page, and can move the frames of `edit`.
+        sees the page, and can move the frames that ``edit`` names.
     origins : iterable of str
         Other web pages that may use this one, such as ``https://robot.example:8443``; the page also answers to the
         names of their hosts. By default there are none, and it answers to addresses, to ``localhost``, to ``host`` and
@@ -134,7 +134,7 @@ class View(AsyncOnly):
     edit : iterable of str
         Static frames that can be moved on the page. Each change is published on the bus, by the authority ``"view"``.
     save : path, optional
-        The file to which the page can save the frames of `edit`, as `tfbus.save_static` does.
+        The file to which the page can save these frames, as `tfbus.recording.save_static` does.
     title : str
         The title of the page.
 
