@@ -226,12 +226,12 @@ def to_html(
     str
         One ``<pre>`` element. All names are escaped, control characters too.
     """
-    drawn = [(guides, frame, printable(frame), edge) for guides, frame, edge in branches(edges)]
+    drawn = [(guides, printable(frame), edge) for guides, frame, edge in branches(edges)]
     if not drawn:
         return f'<pre style="{_PRE}">(no frames)</pre>'
-    width = max(len(guides + name) for guides, _, name, _ in drawn) + 2
+    width = max(len(guides + name) for guides, name, _ in drawn) + 2
     lines = []
-    for guides, frame, name, edge in drawn:
+    for guides, name, edge in drawn:
         style = "font-weight: bold"
         if edge is not None:
             style += f"; color: {state_of(edge, now, stale_after).value}"
