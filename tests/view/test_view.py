@@ -269,17 +269,17 @@ async def test_a_flood_of_orders_waits_at_its_own_connection_and_none_is_lost() 
     shown = Shown(*(moving("map", f"f{number}", 99 * SECOND) for number in range(9)))
     # Between two pictures, much more can arrive than may wait.
     async with shown.page(rate=50.0) as view, PageClient.open(view.address) as page, anyio.create_task_group() as tasks:
+        most = 0
 
         async def flood() -> None:
+            nonlocal most
             for number in range(1_000):
                 await page.do("select", frame=f"f{number % 7}")
+                most = max(most, view.statistics().pending)
             await page.do("select", frame="f8")
 
         tasks.start_soon(flood)
-        most = 0
-        while page.said.get("selection", {}).get("frame") != "f8":
-            page.take([await page.socket.receive()])
-            most = max(most, view.statistics().pending)
+        await page.until(lambda: page.said["selection"]["frame"] == "f8")
         assert 0 < most <= view.statistics().capacity
         assert (view.statistics().dropped, view.refused) == (0, 0)
 
