@@ -21,7 +21,7 @@ from support.processes import Place
 
 from tfbus import SECOND, Bus, Transform, TransformBroadcaster, TransformStamped
 
-PATIENCE = 120.0
+PATIENCE = 60.0
 """Seconds from the last start; a process that has not all frames by then counts as one without them."""
 FRAMES, RATE = 20, 20.0
 

@@ -474,3 +474,14 @@ async def test_when_the_clock_jumps_back_moving_messages_that_wait_are_dropped_a
             await until(lambda: link.statistics().received_samples == 1)
             wire.publish("all", message(is_static=False))
             await until(lambda: bus.statistics().frames == 2)
+
+
+async def test_ctrl_c_in_a_task_of_the_wire_leaves_the_link_as_itself() -> None:
+    class InterruptedWire(MemoryWire):
+        async def run(self) -> None:
+            # trio raises it in the task that runs, and each group of tasks around that wraps it.
+            raise BaseExceptionGroup("tasks of the wire", [KeyboardInterrupt()])
+
+    with pytest.raises(KeyboardInterrupt):
+        async with DomainLink(Bus(), "tf", InterruptedWire(MemoryNetwork(), "")):
+            await anyio.sleep_forever()

@@ -175,6 +175,27 @@ def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer(world: World, netwo
     assert not quiet.end.rejected
 
 
+def test_a_frame_name_of_two_robots_has_the_newest_of_both_and_costs_a_link_that_hears_both_few_questions(
+    world: World, network: Network
+) -> None:
+    one, other = (world.process(network, robot=name, robots=[name]) for name in "ab")
+    both = world.process(network)
+    one.say(static("map", "base"))
+    world.run(1.0)
+    other.say(static("odom", "base"))
+    world.run(20.0)
+    assert [process.frames["base"].parent for process in (one, other, both)] == ["map", "odom", "odom"]
+    assert network.sent(Kind.QUESTION) <= 6
+    for number in range(60):
+        one.say(static("map", f"camera {number}"))
+        world.run(10.0)
+    assert network.sent(Kind.QUESTION) <= 1
+    one.say(static("world", "base"))
+    world.run(20.0)
+    assert [process.frames["base"].parent for process in (one, other, both)] == ["world", "odom", "world"]
+    assert network.sent(Kind.QUESTION) <= 2
+
+
 @pytest.mark.parametrize("drop_lost", [False, True])
 def test_of_robots_that_have_gone_so_many_are_remembered_and_the_oldest_make_room(
     world: World, network: Network, drop_lost: bool

@@ -65,14 +65,14 @@ class World:
         """End a process without a word."""
         self.processes.remove(process)
         for end in process.ends:
-            finish(end.close())
+            finish(end.network.close())
 
     def end(self, process: "Process") -> None:
         """End the links of a process; its bus stays."""
         for end in process.ends:
             end.detach()
             end.send()
-            finish(end.close())
+            finish(end.network.close())
         self.processes.remove(process)
 
     def arrive(self, sender: object, receiver: object, call: Callable[[], object], delay: float = 0.0) -> None:

@@ -119,14 +119,16 @@ async def close_task_group(tasks: anyio.abc.TaskGroup) -> None:
     """Wait until all tasks have ended, and raise the error of a single failed task without an `ExceptionGroup`.
 
     The group was entered by hand. It is not told of an error in the body of the ``async with``, because it would wrap
-    that error as well.
+    that error as well. On trio, Ctrl-C may be raised in a task of a group within this one, and is raised as itself too.
     """
     try:
         await tasks.__aexit__(None, None, None)
     except BaseExceptionGroup as group:
-        if len(group.exceptions) > 1:
+        error: BaseException = group
+        while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:
+            error = error.exceptions[0]
+        if error is group:
             raise
-        error = group.exceptions[0]
     else:
         return
     raise_unchanged(error)

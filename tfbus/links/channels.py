@@ -12,12 +12,7 @@ from math import inf
 from typing import Final
 
 from tfbus.links.endpoint import MAX_PEERS
-from tfbus.links.message import (
-    Kind,
-    Outgoing,
-    Way,
-    write_message,
-)
+from tfbus.links.message import Kind, Outgoing, Way, write_message
 from tfbus.links.replica import Entry, OutgoingBatch, RemovedFrame, View, hash_bytes
 from tfbus.links.seams import SendReport, Wire
 
@@ -26,8 +21,6 @@ SLOW: Final = "slow"
 MOST_FILTERS = 100
 LONGEST_FILTER = 2**16
 """Bytes; a link whose names take more receives all frames, and drops the unwanted ones."""
-FULL_MESSAGE = 5_000
-"""A message with so many samples and removals is full; the batch that fills it is still whole."""
 _FORGOTTEN = 30.0
 """s after which a filter without listeners is forgotten."""
 
@@ -157,18 +150,6 @@ class Channels:
                     newest[fields[1]] = OutgoingBatch(entry.origin, entry.sequence, (sample,))
 
     def _write(self, channel: _Channel, entries: Sequence[Entry]) -> None:
-        gathered: list[Entry] = []
-        size = 0
-        for entry in entries:
-            gathered.append(entry)
-            size += entry.size
-            if size >= FULL_MESSAGE:
-                self._write_one(channel, gathered)
-                gathered, size = [], 0
-        if gathered or not entries:
-            self._write_one(channel, gathered)
-
-    def _write_one(self, channel: _Channel, entries: list[Entry]) -> None:
         """One message of all entries if possible, else several; a batch that is too large is left out and reported."""
         size = sum(entry.size for entry in entries)
         number = 0 if channel is self._slow else channel.number + 1
@@ -178,8 +159,8 @@ class Channels:
         except ValueError as error:
             middle = len(entries) // 2
             if middle:
-                self._write_one(channel, entries[:middle])
-                self._write_one(channel, entries[middle:])
+                self._write(channel, entries[:middle])
+                self._write(channel, entries[middle:])
             else:
                 self._report.refused("oversized", error, size)
             return

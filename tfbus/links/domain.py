@@ -157,7 +157,6 @@ class DomainEnd(Endpoint):
 
     def attach(self) -> None:
         self.relay.attach(self)
-        self.lookups.open()
 
     def detach(self) -> None:
         self.lookups.close()

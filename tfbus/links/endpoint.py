@@ -18,7 +18,7 @@ from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.relay import REMEMBERED_REASONS, Outbox, Peer, Relay, relay_of
 from tfbus.links.replica import Entry
-from tfbus.links.seams import Joined, Left, Received, SendReport
+from tfbus.links.seams import Joined, Left, Network, Received, SendReport
 from tfbus.tf_message import MalformedMessageError
 
 MAX_PEERS = 1_000
@@ -32,34 +32,6 @@ class HearsTime(Protocol):
 
     def hear(self, stamp: int) -> None:
         """Take the time of the other program, a stamp in ns."""
-
-
-class Host(Protocol):
-    """The event loop and the link, as an end needs them."""
-
-    def receive(self, item: Received) -> None:
-        """Handle an item later, on the event loop; for any thread."""
-
-    def send_soon(self, pending: int) -> None:
-        """Call `Endpoint.send` at the end of the turn of the event loop; `pending` samples wait."""
-
-    def is_behind(self) -> bool:
-        """Whether items wait to be handled."""
-
-    def stir(self) -> None:
-        """Call `Endpoint.work` earlier than at the time that it has returned."""
-
-
-class Network(Protocol):
-    """The wire or the carrier below an end."""
-
-    id: str
-
-    async def run(self) -> None:
-        """Do what takes time, until cancelled."""
-
-    async def close(self) -> None:
-        """Disconnect."""
 
 
 class Endpoint(Outbox, ABC):
@@ -82,8 +54,7 @@ class Endpoint(Outbox, ABC):
     ----------
     id : str
         The name of this end for its peers.
-    host : Host
-        Set by the link before anything is called.
+    network : Network
     follower : HearsTime or None
         Hears the time of the first peer that tells one, until that peer is lost.
     peers : dict of str to Peer
@@ -101,8 +72,6 @@ class Endpoint(Outbox, ABC):
         How many samples were no news.
     """
 
-    host: Host
-
     def __init__(
         self,
         bus: Bus,
@@ -118,7 +87,7 @@ class Endpoint(Outbox, ABC):
         self.bus = bus
         self.name = name
         self.id: str = network.id
-        self._network = network
+        self.network: Network = network
         self.drop_lost = drop_lost
         self.max_frames = max_frames
         self.follower: HearsTime | None = None
@@ -141,14 +110,6 @@ class Endpoint(Outbox, ABC):
     @abstractmethod
     async def open(self) -> None:
         """Connect to the network; raises `OSError` if it cannot."""
-
-    async def run(self) -> None:
-        """Do what takes time, until cancelled."""
-        await self._network.run()
-
-    async def close(self) -> None:
-        """Disconnect."""
-        await self._network.close()
 
     @abstractmethod
     def attach(self) -> None:
@@ -173,7 +134,7 @@ class Endpoint(Outbox, ABC):
             # Samples that were published before the jump are of the time before it.
             self.send()
         self.time, self._time_waits = stamp, True
-        self._notify()
+        self.host.send_soon(self.pending)
 
     def send(self) -> None:
         """Hand the gathered entries to the network, if there are any."""
@@ -291,13 +252,6 @@ class Endpoint(Outbox, ABC):
             error = ValueError(f"this bus follows the clock of peer {self._followed}")
             self.reject(sender, "second clock", error)
 
-    def _count(self, sender: str, offered: int, published: int, refused: int) -> None:
-        self.samples += published
-        self.duplicates += offered - published - refused
-        if refused:
-            error = ValueError(f"the peer has announced more than {self.max_frames} frames")
-            self.reject(sender, "too many frames", error, refused)
-
     def _warn_not_sent(self, error: Exception) -> None:
         self._log.warning(str(error), "not sent over the link %s: %s", self.name, error)
 
@@ -312,6 +266,3 @@ class Endpoint(Outbox, ABC):
             peer.authorities.add(authority)
             peer.authority_text = text
         return True
-
-    def _notify(self) -> None:
-        self.host.send_soon(self.pending)

@@ -315,13 +315,13 @@ class Link(AsyncOnly):
             await self._end.open()
             self._end.attach()
         except BaseException:
-            await self._end.close()
+            await self._end.network.close()
             raise
         self._attached = True
         self.bus._entered.add(self)
         self._registrations.append(self.bus.clock.on_jump(self._clock_jumped))
         self._tasks = await anyio.create_task_group().__aenter__()
-        self._tasks.start_soon(self._end.run)
+        self._tasks.start_soon(self._end.network.run)
         self._tasks.start_soon(self._work)
         if isinstance(self._end.follower, ClockFollower):
             self._tasks.start_soon(self._end.follower.run)
@@ -347,7 +347,7 @@ class Link(AsyncOnly):
             await close_task_group(self._tasks)
         finally:
             self.bus._entered.discard(self)
-            await self._end.close()
+            await self._end.network.close()
 
     def _check_loop(self) -> None:
         self.bus._owner.check_process()

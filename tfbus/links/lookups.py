@@ -27,7 +27,6 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.message import (
     Kind,
     RemoteQuestion,
-    as_timeout,
     read_answer,
     read_question,
     write_answer,
@@ -85,14 +84,10 @@ class RemoteLookups:
         # The peers that serve a buffer, and their robots.
         self._servers: dict[str, str] = {}
         self._changed = anyio.Event()
-        self._is_open = False
+        self._is_open = True
         self.server: BufferServer | None = None
 
     # Coming in
-
-    def open(self) -> None:
-        """The link is there."""
-        self._is_open = True
 
     def close(self) -> None:
         """The link ends."""
@@ -387,7 +382,8 @@ class BufferServer(AsyncOnly):
             return
         with scope:
             try:
-                timeout = as_timeout(question.timeout, LONGEST_WAIT)
+                # Not a number is not less either.
+                timeout = LONGEST_WAIT if question.timeout is None else min(LONGEST_WAIT, question.timeout)
                 answer = await self._buffer.lookup(**_arguments(question), timeout=timeout)
             except Exception as error:  # noqa: BLE001 - it is told to the asker
                 answer = error

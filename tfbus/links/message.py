@@ -27,7 +27,6 @@ They raise nothing but a `ValueError`.
 
 import enum
 import json
-import math
 import struct
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -183,8 +182,10 @@ def write_message(out: Outgoing, entries: Sequence[Entry] = ()) -> bytes:
             samples += entry.samples
     if len(samples) > MAX_SAMPLES:
         raise ValueError(f"a message of {len(samples)} samples, more than {MAX_SAMPLES}")
-    head = _head(out, entries)
-    message = head + encode(samples) if samples else head
+    try:
+        message = _head(out, entries) + (encode(samples) if samples else b"")
+    except struct.error as error:
+        raise ValueError(f"too much for one message: {error}") from None
     if len(message) > MAX_BYTES:
         raise ValueError(f"a message of {len(samples)} samples has {len(message)} bytes, more than {MAX_BYTES}")
     return message
@@ -204,7 +205,7 @@ def sendable(entry: Entry, refuse: Callable[[str, Exception], object]) -> Entry 
     """The part of an entry that a message can hold, None for nothing; the rest is refused with its reason and error."""
     if isinstance(entry, RemovedFrame):
         try:
-            _head(Outgoing(Kind.LIVE, b""), [entry])
+            write_message(Outgoing(Kind.LIVE, b""), [entry])
         except ValueError as error:
             refuse("frame name", error)
             return None
@@ -264,21 +265,18 @@ def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
             name = entry.frame.encode()
             if len(name) > MAX_NAME:
                 raise ValueError(f"too much for one message: a frame name of {len(name)} bytes")
-            body += _pack(_ENTRY, _REMOVAL, origin, len(name), entry.sequence) + name
+            body += _ENTRY.pack(_REMOVAL, origin, len(name), entry.sequence) + name
             continue
         tags = [
             2 * authorities.setdefault(authority, len(authorities)) + static
             for _, _, _, _, authority, static in (sample._fields for sample in entry.samples)
         ]
-        body += _pack(_ENTRY, _BATCH, origin, len(tags), entry.sequence) + struct.pack(f"<{len(tags)}H", *tags)
+        body += _ENTRY.pack(_BATCH, origin, len(tags), entry.sequence) + struct.pack(f"<{len(tags)}H", *tags)
     claim = out.claim
     flags = _FINAL * claim.final | _PARTIAL * claim.partial | _HAS_TIME * (out.time is not None) | _SERVES * out.serves
     counts = len(out.reach), len(origins), len(authorities), len(entries)
-    head = bytearray(
-        _pack(
-            _HEADER, VERSION, out.kind, flags, *counts, out.number, out.bus, claim.since, claim.sequence, claim.digest
-        )
-    )
+    held = claim.since, claim.sequence, claim.digest
+    head = bytearray(_HEADER.pack(VERSION, out.kind, flags, *counts, out.number, out.bus, *held))
     if out.time is not None:
         head += _TIME.pack(out.time)
     for bus, path in out.reach:
@@ -286,17 +284,10 @@ def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
     head += b"".join(origins)
     for authority in authorities:
         text = authority.encode()
-        head += _pack(_LENGTH, len(text)) + text
+        head += _LENGTH.pack(len(text)) + text
     if len(head) + len(body) > MAX_HEAD:
         raise ValueError(f"too much for one message: {len(head) + len(body)} bytes before the samples")
     return bytes(head + body)
-
-
-def _pack(layout: struct.Struct, *values: object) -> bytes:
-    try:
-        return layout.pack(*values)
-    except struct.error as error:
-        raise ValueError(f"too much for one message: {error}") from None
 
 
 # Reading
@@ -498,7 +489,7 @@ def write_answer(answer: TransformStamped | Exception) -> bytes:
     """The bytes of an answer, or of the error of a lookup."""
     if isinstance(answer, (TransformStamped, TransformError)):
         return json.dumps(answer.to_dict()).encode()
-    kind = next((name for name, kind in _ARGUMENT_ERRORS.items() if isinstance(answer, kind)), "Exception")
+    kind = "TypeError" if isinstance(answer, TypeError) else "ValueError"
     return json.dumps({"type": kind, "message": str(answer)}).encode()
 
 
@@ -537,11 +528,6 @@ def _check_answers(answer: TransformStamped, question: RemoteQuestion) -> None:
         raise ValueError(f"it is about {_shown(answer.parent)} and {_shown(answer.child)}")
     if not (answer.static or isinstance(question.at, Latest) or answer.stamp == question.at):
         raise ValueError(f"it is of the stamp {answer.stamp}, not of {question.at}")
-
-
-def as_timeout(timeout: float | None, longest: float) -> float:
-    """The timeout of a question at the server, which waits for so long at most."""
-    return longest if timeout is None or math.isnan(timeout) else min(timeout, longest)
 
 
 def _read(data: bytes) -> dict[str, Any]:

@@ -36,6 +36,7 @@ from tfbus.errors import UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.links.message import can_hold, sendable
 from tfbus.links.replica import Entry, Known, OutgoingBatch, Provenance, ReceivedTransform, RemovedFrame, Replica, View
+from tfbus.links.seams import Host
 from tfbus.registration import Registration
 from tfbus.rows import Row
 
@@ -59,6 +60,8 @@ class Outbox:
 
     Attributes
     ----------
+    host : Host
+        Set by the link before anything is called.
     frames : frozenset of str or None
     pending : int
         How many samples and removals wait to go out.
@@ -68,6 +71,7 @@ class Outbox:
         The view of them that this link tells; None if it tells no entries.
     """
 
+    host: Host
     own: View | None = None
 
     def __init__(self, frames: Iterable[str] | None) -> None:
@@ -82,7 +86,7 @@ class Outbox:
         if entry is not None:
             self._entries.append(entry)
             self.pending += entry.size
-            self._notify()
+            self.host.send_soon(self.pending)
 
     def outgoing(self, entry: Entry) -> Entry | None:
         """The part of an entry that this link may send; None if it may send nothing of it."""
@@ -94,10 +98,6 @@ class Outbox:
 
     def reach_changed(self) -> None:
         """The buses that this one reaches by other links have changed."""
-
-    def _notify(self) -> None:
-        """Note that the outbox has something to send."""
-        raise NotImplementedError
 
 
 @dataclass(eq=False, slots=True)
@@ -379,7 +379,8 @@ class Relay:
             return
         removal = RemovedFrame(source.origin, source.sequence, frame)
         if known is None or known.source is not source:
-            self.replica.note(frame, source, None, self._route if sendable(removal, _ignore) else ())
+            # The outboxes report one that cannot be sent.
+            self.replica.note(frame, source, None, self._route if sendable(removal, lambda *_: None) else ())
         if known is not None and known.passed:
             # Copies of the last samples may come late.
             known.passed = dict.fromkeys(list(known.passed)[-_PASSED_OF_GONE:])
@@ -393,10 +394,6 @@ def relay_of(bus: Bus) -> Relay:
     if not isinstance(bus._relay, Relay):
         bus._relay = Relay(bus)
     return bus._relay
-
-
-def _ignore(reason: str, error: Exception) -> None:
-    """The outboxes report it."""
 
 
 def _source_of(sample: TransformStamped) -> Provenance | None:

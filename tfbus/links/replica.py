@@ -36,7 +36,9 @@ Each bus numbers the changes of its copy: its *sequence* (as Syncthing does). An
 changed for `SETTLING`; a static sample, a removal, and what an answer has told are settled at once. The digest is over
 settled entries, so a frame that moves many times a second does not make copies differ.
 
-1. A sign with the digest of one's own copy needs nothing: what that copy holds up to its sequence is here.
+1. A sign with the digest of one's own copy needs nothing: what that copy holds up to its sequence is here. Nor does a
+   sign whose digest differs as after the last full answer: that copy has older entries, and nobody tells it the newer
+   ones, as where two robots do not hear each other and use one frame name.
    A copy of some frames only is compared over these, once its link has asked for them.
 2. If the digests differ, and the sequence in the sign is beyond the last one seen of that copy, the link asks the peer
    a little later, if they differ still. If a number is missing among its live messages, the link asks the peer soon.
@@ -70,6 +72,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from math import inf
+from operator import itemgetter
 from random import uniform
 from typing import Any, ClassVar, NamedTuple
 
@@ -404,7 +407,7 @@ class Replica:
             # Numbered now for the order of this answer, and again when it settles, for the links without this answer.
             if not self.entries[frame].sequence:
                 self._number(self.entries[frame])
-        log = islice(self._log, bisect_right(self._log, since, key=_first), None)
+        log = islice(self._log, bisect_right(self._log, since, key=itemgetter(0)), None)
         return (known for sequence, known in log if known.sequence == sequence)
 
     def settle(self, now: float) -> None:
@@ -550,10 +553,6 @@ def hash_bytes(data: bytes, size: int) -> bytes:
     return blake2b(data, digest_size=size).digest()
 
 
-def _first(logged: tuple[int, Known]) -> int:
-    return logged[0]
-
-
 # The questions
 
 
@@ -581,6 +580,9 @@ class _Copy:
         Whether live messages are missing.
     fruitless, silences : int
         Answers without news, and questions without an answer, one after the other.
+    differs : int
+        The difference of the digests after an answer with all that the peer had: entries that are older than the own
+        ones, and that nobody tells the peer, as where it is a robot that does not hear another one with its frames.
     """
 
     view: View
@@ -594,6 +596,7 @@ class _Copy:
     missed: bool = False
     fruitless: int = 0
     silences: int = 0
+    differs: int = 0
 
 
 class Question(NamedTuple):
@@ -684,7 +687,8 @@ class Agreement:
         copy.again = now + _ASK_AGAIN if copy.must_ask else inf
         if claim.final:
             copy.due, copy.urgent, copy.missed, copy.claim, copy.silences = inf, False, False, claim, 0
-            copy.fruitless = 0 if news or self._agrees(copy, now) else min(copy.fruitless + 1, 10)
+            copy.differs = self._difference(copy, claim, now)
+            copy.fruitless = min(copy.fruitless + 1, 10) if copy.differs and not news else 0
 
     def unanswered(self, peer: str, now: float) -> None:
         """Note that a peer has not answered."""
@@ -745,7 +749,11 @@ class Agreement:
         return min(map(self._due_of, self._copies), default=inf)
 
     def _agrees(self, copy: _Copy, now: float) -> bool:
-        return copy.claim is not None and copy.claim.digest == copy.view.claim(now, copy.frames).digest
+        return copy.claim is not None and self._difference(copy, copy.claim, now) in (0, copy.differs)
+
+    @staticmethod
+    def _difference(copy: _Copy, claim: Claim, now: float) -> int:
+        return claim.digest ^ copy.view.claim(now, copy.frames).digest
 
     def _fail(self, copy: _Copy, now: float) -> None:
         copy.silences = min(copy.silences + 1, 10)

@@ -168,6 +168,34 @@ class Received:
     follows: bool = False
 
 
+class Network(Protocol):
+    """The wire or the carrier below an end."""
+
+    id: str
+
+    async def run(self) -> None:
+        """Do what takes time, until cancelled."""
+
+    async def close(self) -> None:
+        """Disconnect."""
+
+
+class Host(Protocol):
+    """The event loop and the link, as an end needs them."""
+
+    def receive(self, item: Received) -> None:
+        """Handle an item later, on the event loop; for any thread."""
+
+    def send_soon(self, pending: int) -> None:
+        """Call `Endpoint.send` at the end of the turn of the event loop; `pending` samples wait."""
+
+    def is_behind(self) -> bool:
+        """Whether items wait to be handled."""
+
+    def stir(self) -> None:
+        """Call `Endpoint.work` earlier than at the time that it has returned."""
+
+
 class SendReport:
     """Counts the messages and samples that a carrier has sent or could not send; for the event loop only.
 

@@ -191,7 +191,7 @@ class ForeignEnd(Endpoint):
             if frame in self._latched or not (echo or latched is None):
                 (self._latched.discard if latched is None else self._latched.add)(frame)
                 self._changes[frame] = latched
-                self._notify()
+                self.host.send_soon(self.pending)
 
     def _send(self, entries: Sequence[Entry], time: int | None) -> None:
         changes, self._changes = self._changes, {}
@@ -243,4 +243,8 @@ class ForeignEnd(Endpoint):
             news.append(sample)
         if news:
             self.bus.publish(news, invalid="drop")
-        self._count(peer.id, len(samples), len(news), refused)
+        self.samples += len(news)
+        self.duplicates += len(samples) - len(news) - refused
+        if refused:
+            error = ValueError(f"the peer has announced more than {self.max_frames} frames")
+            self.reject(peer.id, "too many frames", error, refused)
