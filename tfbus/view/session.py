@@ -1,8 +1,31 @@
 """The model of the page: the part that its browsers share, and the part that is of each browser.
 
 A `Session` belongs to one browser. It takes the orders of a person (`read`, `do`), and `picture` gives the messages
-that bring the browser up to date: texts of JSON, and bytes. It knows no socket and no event loop, and repeats no
-message unless its content has changed. The `Page` has what all sessions share: the tree, points, events.
+that bring the browser up to date. It knows no socket and no event loop, and repeats no message unless its content has
+changed. The `Page` has what all sessions share: the tree, points, events.
+
+An order is an object of JSON with the name of the order as ``do``; `_ACTIONS` lists them, and the arguments of their
+functions are the other keys. A browser receives texts of JSON with a ``type``. Stamps are texts of ns, because numbers
+of JavaScript have 53 bits.
+
+============= ======================================================================================================
+type          content
+============= ======================================================================================================
+``hello``     facts about the page, which come first
+``frames``    the ``names`` of all frames, first those that are connected with the fixed one; the places of ``parents``
+``states``    a word of `_STATES` for each of these names
+``clouds``    the names of the points
+``time``      the mode, the stamp that is shown, the span; at least twice a second, as a sign of life
+``selection`` the facts about the selected frame, its chain, and its pose in its parent
+``edited``    the pose in its parent of a frame that can be moved; when it has changed
+``events``    new events
+``error``     the reason why an order was refused
+``saved``     the path and the frames of a file that was written
+============= ======================================================================================================
+
+A message of bytes begins with its kind and three zeros. `POSES` has seven numbers of 32 bits for each name of
+``frames``, and then for each of ``clouds``: the position in m and the quaternion (x, y, z, w) in the fixed frame, NaN
+where there is no pose. `POINTS`, `TRAILS` and `ROBOT` have a header in JSON and arrays, as `framed` writes them.
 """
 
 import json
