@@ -23,7 +23,10 @@ export class Camera {
     this.framed = 0; // The number of frames in the picture that was framed.
     this.last = null; // Where the followed frame was.
     state.on("poses", () => this.#posesChanged());
-    state.on("choices", () => (this.last = null));
+    state.on("choices", () => {
+      this.last = null;
+      this.#follow();
+    });
     state.on("robot", () => !this.moved && this.fit());
     new ResizeObserver(() => !this.moved && this.fit()).observe(canvas);
   }

@@ -3,6 +3,8 @@
 // The selected, measured and pointed frames come first, then the chain, then the fixed frame. Of the others, those count
 // that carry many frames, and those that are near.
 
+import { printable } from "./state.js";
+
 const FEW = 20;
 const GAP = 8; // From the dot to its name, in pixels.
 const HEIGHT = 17;
@@ -31,13 +33,12 @@ export class Names {
     for (const { name, x, y, rank } of this.#candidates()) {
       if (kept.size >= most && rank === 0) break;
       const box = [this.#width(name) + 2 * PADDING, HEIGHT];
-      // To the right of its dot, or else to the left, above or below.
-      const corners = [
-        [x + GAP, y - HEIGHT / 2],
-        [x - GAP - box[0], y - HEIGHT / 2],
-        [x - box[0] / 2, y - GAP - HEIGHT],
-        [x - box[0] / 2, y + GAP],
-      ];
+      // To the right of its dot, or else to the left, or in the lines above and below; not beyond the picture.
+      const middle = Math.min(Math.max(x - box[0] / 2, 0), width - box[0]);
+      const corners = [0, -1, 1, -2, 2].flatMap((line) => {
+        const top = y + line * (HEIGHT + 1) - HEIGHT / 2;
+        return [x + GAP, x - GAP - box[0], ...(line ? [middle] : [])].map((left) => [left, top]);
+      });
       const corner = corners.find(([left, top]) => {
         const right = left + box[0];
         const bottom = top + box[1];
@@ -94,7 +95,7 @@ export class Names {
       let label = this.#labels.get(name);
       if (!label) {
         label = document.createElement("span");
-        label.textContent = name;
+        label.textContent = printable(name);
         this.container.append(label);
         this.#labels.set(name, label);
       }
@@ -106,7 +107,7 @@ export class Names {
   #width(name) {
     let width = this.#widths.get(name);
     if (width === undefined) {
-      width = Math.min(this.#pen.measureText(name).width, 240);
+      width = Math.min(this.#pen.measureText(printable(name)).width, 240);
       this.#widths.set(name, width);
     }
     return width;

@@ -3,6 +3,7 @@
 
 import * as THREE from "./three/three.module.min.js";
 import { STATES, TRAILS } from "./scene.js";
+import { printable } from "./state.js";
 import { wallTime } from "./time.js";
 
 const NOTE = 8_000; // In ms.
@@ -82,7 +83,7 @@ export class Panel {
     const { selected } = state;
     byId("hint").hidden = selected !== null;
     byId("selected").hidden = selected === null;
-    byId("selected-name").textContent = selected ?? "";
+    byId("selected-name").textContent = printable(selected ?? "");
     const hidden = state.hidden.has(selected);
     byId("hide-frame").setAttribute("aria-pressed", hidden);
     byId("hide-branch").hidden = !state.below[state.index.get(selected)]?.length;
@@ -95,12 +96,12 @@ export class Panel {
       byId(id).hidden = !shown;
       byId(id).textContent = text;
     };
-    chip("fixed", state.chosenFixed !== null, `Fixed: ${state.chosenFixed} ✕`);
-    chip("follow-end", follow !== null, `Follows ${follow?.frame} ✕`);
+    chip("fixed", state.chosenFixed !== null, `Fixed: ${printable(state.chosenFixed ?? "")} ✕`);
+    chip("follow-end", follow !== null, `Follows ${printable(follow?.frame ?? "")} ✕`);
     const names = state.chain.map((place) => state.names[place]);
     byId("chain").replaceChildren(
       ...names.flatMap((name, k) => {
-        const step = make("button", name, { class: "link" });
+        const step = make("button", printable(name), { class: "link" });
         step.addEventListener("click", () => this.actions.select(name));
         return k ? [make("span", " → "), step] : [step];
       }),
@@ -165,8 +166,8 @@ export class Panel {
       const degrees = (angle) => THREE.MathUtils.radToDeg(angle).toFixed(2);
       const angle = 2 * Math.acos(Math.min(Math.abs(turn.w), 1));
       text.textContent = [
-        `to ${state.measured}: ${offset.length().toFixed(4)} m, ${degrees(angle)}°`,
-        `x y z ${offset.toArray().map((part) => part.toFixed(4)).join(" ")} m, in the axes of ${state.selected}`,
+        `to ${printable(state.measured)}: ${offset.length().toFixed(4)} m, ${degrees(angle)}°`,
+        `x y z ${offset.toArray().map((part) => part.toFixed(4)).join(" ")} m, in the axes of ${printable(state.selected)}`,
         `roll pitch yaw ${[x, y, z].map(degrees).join(" ")}°`,
       ].join("\n");
     }
@@ -177,7 +178,7 @@ export class Panel {
     byId("event-list").replaceChildren(
       ...events.toReversed().map(({ at, frame, text, peer }) => {
         const button = make("button", "");
-        button.append(make("time", wallTime(at)), make("span", text), ...(peer ? [make("code", peer.slice(0, 8))] : []));
+        button.append(make("time", wallTime(at)), make("span", printable(text)), ...(peer ? [make("code", peer.slice(0, 8))] : []));
         button.title = frame === null ? "Go to this moment" : "Go to this frame and moment";
         button.addEventListener("click", () => this.actions.goTo(frame, at));
         const item = make("li", "");

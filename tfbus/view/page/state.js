@@ -161,3 +161,8 @@ export function matcher(filter) {
   return (name) =>
     (!wanted.length || wanted.some((each) => each.test(name))) && !unwanted.some((each) => each.test(name));
 }
+
+// A name without the characters that would hide a letter, turn the line around or begin another one: they are escaped.
+export function printable(name) {
+  return name.replace(/\p{C}|[\p{Zl}\p{Zp}]|(?! )\p{Zs}/gu, (letter) => `\\u{${letter.codePointAt(0).toString(16)}}`);
+}

@@ -3,9 +3,9 @@
 // Frames with a prefix of their own, such as those of robot1/, stand together below a row of the prefix. Only the rows
 // in sight are elements.
 
-import { matcher } from "./state.js";
+import { matcher, printable } from "./state.js";
 
-const FIRST_ROWS = 60; // The levels that are open at first have about so many rows.
+const FIRST_ROWS = 40; // The levels that are open at first have about so many rows.
 const collator = new Intl.Collator(undefined, { numeric: true });
 
 export class Tree {
@@ -152,16 +152,16 @@ export class Tree {
     slot.style.transform = `translateY(${top}px)`;
     slot.twist.style.marginLeft = `${14 * row.level}px`;
     setText(slot.twist, row.children ? (row.open ? "▾" : "▸") : "");
-    setText(slot.name, row.label);
+    setText(slot.name, printable(row.label));
     setText(slot.count, row.count ? `${row.count} frames` : "");
-    slot.title = row.frame ?? "";
+    slot.title = printable(row.frame ?? "");
     slot.dot.className = `dot ${row.frame === undefined ? "none" : state.states[row.place]}`;
     const faint = row.frame !== undefined && !(state.shown[row.place] && (state.hasPose(row.place) || !state.poses.length));
     slot.className = [selected && "selected", faint && "faint", row.frame === undefined && "group"].filter(Boolean).join(" ");
     const attributes = {
       "aria-level": row.level + 1,
       "aria-selected": selected,
-      "aria-label": row.frame === undefined ? `${row.label}, ${row.count} frames` : `${row.frame}, ${state.states[row.place]}`,
+      "aria-label": printable(row.frame ?? row.label) + (row.frame ? `, ${state.states[row.place]}` : `, ${row.count} frames`),
     };
     for (const [name, value] of Object.entries(attributes)) {
       if (slot.getAttribute(name) !== String(value)) slot.setAttribute(name, value);
@@ -170,7 +170,7 @@ export class Tree {
     else slot.removeAttribute("aria-expanded");
     slot.eye.className = hidden ? "eye closed" : "eye";
     slot.eye.setAttribute("aria-pressed", hidden);
-    slot.eye.setAttribute("aria-label", `Hide ${row.label}`);
+    slot.eye.setAttribute("aria-label", `Hide ${printable(row.label)}`);
     slot.eye.title = row.children ? "Hide or show this branch (with Shift: this frame alone)" : "Hide or show this frame";
   }
 
