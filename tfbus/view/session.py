@@ -492,6 +492,8 @@ class Session:
         self._fixed: str | None = None
         self._structure: object = None
         self._named: object = None
+        self._asked: object = None
+        self._poses: Poses | None = None
         self._others: list[str] = []
         self._other_codes: list[int] = []
         self._show(page.tree)
@@ -507,7 +509,7 @@ class Session:
     def _show(self, tree: TransformTree) -> None:
         self._tree = tree
         self._reader = PoseReader(forest_of(tree))
-        self._structure = self._named = None
+        self._structure = self._named = self._asked = None
 
     # The orders of a person
 
@@ -702,10 +704,14 @@ class Session:
 
     def _frames(self, at: int | Latest, then: int, with_texts: bool) -> Iterator[Message]:
         """The frames if they are others, their states if those have changed, and the poses."""
-        fixed, poses = self._fixed, None
-        if fixed is not None:
-            with suppress(UnknownFrameError):
-                poses = self._reader.read(fixed, at)
+        fixed = self._fixed
+        asked = forest_of(self._tree).version, fixed, at
+        if asked != self._asked:
+            self._asked, self._poses = asked, None
+            if fixed is not None:
+                with suppress(UnknownFrameError):
+                    self._poses = self._reader.read(fixed, at)
+        poses = self._poses
         named = self._reader.topology, self._structure, fixed, self._chosen
         if named != self._named:
             self._named = named
