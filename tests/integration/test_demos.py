@@ -349,7 +349,10 @@ def test_the_demo_of_events_tells_the_story_of_the_tool() -> None:
     assert lines[-1] == "rejected: {'reserved': 1}, conflicts: 1"
 
 
-@pytest.mark.parametrize(("demo", "page"), [("localisation", "localisation"), ("scans_in_map", "recordings")])
+@pytest.mark.parametrize(
+    ("demo", "page"),
+    [("localisation", "localisation"), pytest.param("scans_in_map", "recordings", marks=pytest.mark.thorough)],
+)
 def test_a_demo_prints_what_its_page_says(demo: str, page: str) -> None:
     said = "\n".join(output_of(f"{demo}.py", quiet=True))
     assert f"```text\n{said}\n```" in (DEMOS / "guide" / f"{page}.md").read_text()
@@ -522,7 +525,7 @@ def test_nothing_stays_in_the_web_application_of_clients_that_have_left() -> Non
                 await asyncio.sleep(0.01)
             before = len(asyncio.all_tasks())
             address = f"127.0.0.1:{listener.getsockname()[1]}"
-            await asyncio.gather(*(leave(address, number % 2 == 0) for number in range(200)))
+            await asyncio.gather(*(leave(address, number % 2 == 0) for number in range(40)))
             while len(asyncio.all_tasks()) > before:  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
             gc.collect()
@@ -533,7 +536,7 @@ def test_nothing_stays_in_the_web_application_of_clients_that_have_left() -> Non
     asyncio.run(main())
 
 
-@pytest.mark.parametrize("loop", ["asyncio", "uvloop"])
+@pytest.mark.parametrize("loop", ["asyncio", pytest.param("uvloop", marks=pytest.mark.thorough)])
 def test_at_a_signal_the_web_application_ends_its_streams_and_waits(loop: str) -> None:
     pytest.importorskip(loop)
 

@@ -1,6 +1,7 @@
 """Hypothesis strategies for what tfbus takes, with the rotations and names that have broken code before."""
 
 import math
+from functools import cache
 
 from hypothesis import strategies as st
 
@@ -14,12 +15,14 @@ TODAY = 1_790_000_000 * SECOND
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 
 
+@cache
 def vectors(limit: float = 1_000.0) -> st.SearchStrategy[Vector]:
     """Three numbers from -limit to limit."""
     number = st.floats(-limit, limit)
     return st.tuples(number, number, number)
 
 
+@cache
 def unit_vectors() -> st.SearchStrategy[Vector]:
     """The axes, and anything between them."""
     return st.sampled_from(_AXES) | vectors(1.0).filter(lambda vector: math.hypot(*vector) > 0.1).map(_normalised)
@@ -31,11 +34,13 @@ def _normalised(vector: Vector) -> Vector:
     return x / length, y / length, z / length
 
 
+@cache
 def small_angles() -> st.SearchStrategy[float]:
     """From 1e-12 to 1e-3 rad, every decade as likely as the next."""
     return st.floats(-12.0, -3.0).map(lambda exponent: 10.0**exponent)
 
 
+@cache
 def angles() -> st.SearchStrategy[float]:
     """Rad from -pi to pi: anything, next to nothing, nearly half a turn, and the right angles."""
     return st.one_of(
@@ -56,6 +61,7 @@ def rotations(draw: st.DrawFn) -> Quaternion:
     return x * sine, y * sine, z * sine, sign * math.cos(half)
 
 
+@cache
 def transforms(limit: float = 1_000.0) -> st.SearchStrategy[Transform]:
     """Transforms with translations from -limit to limit m in each axis."""
     return st.builds(Transform, vectors(limit), rotations())
@@ -65,12 +71,14 @@ CHARACTERS = st.characters(exclude_categories=["Cs"])
 """The default alphabet of `st.text`, which takes hypothesis seconds in each process to work out from a codec."""
 
 
+@cache
 def frame_names() -> st.SearchStrategy[str]:
     """Everything that may name a frame: blanks, quotes, newlines, any alphabet."""
     odd = st.sampled_from(("base link", " ", 'a"b', "a\\b", "a\nb", "a/b", "NO_PARENT", "küche", "腕", "🦾", "null"))
     return odd | st.text(CHARACTERS, min_size=1, max_size=12).filter(lambda name: not name.startswith("/"))
 
 
+@cache
 def stamps(low: int = STAMP_MIN, high: int = STAMP_MAX) -> st.SearchStrategy[int]:
     """Nanoseconds from low to high; where the range allows it, often near zero and near today's."""
     ranges = [st.integers(low, high)]

@@ -150,7 +150,9 @@ def test_no_change_of_a_history_changes_its_columns_that_somebody_holds(kernel: 
 
 
 @on_both
-@pytest.mark.parametrize(("keep", "disturbed"), [(19_999, False), (19_999, True), (None, True)])
+@pytest.mark.parametrize(
+    ("keep", "disturbed"), [pytest.param(19_999, False, marks=pytest.mark.thorough), (19_999, True), (None, True)]
+)
 def test_a_long_history_has_all_samples_of_its_window_at_all_times(
     kernel: ModuleType, keep: int | None, disturbed: bool
 ) -> None:
@@ -643,6 +645,7 @@ def test_python_is_the_twin() -> None:
     assert run("python").stdout.split() == ["python", "tfbus._python_kernel"]
 
 
+@pytest.mark.thorough
 @needs_both
 def test_trees_and_buses_are_as_their_models_say_on_the_python_kernel_too() -> None:
     tests = Path(__file__).parents[1]

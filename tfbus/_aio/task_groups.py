@@ -124,11 +124,13 @@ async def close_task_group(tasks: anyio.abc.TaskGroup) -> None:
     try:
         await tasks.__aexit__(None, None, None)
     except BaseExceptionGroup as group:
-        error: BaseException = group
-        while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:
-            error = error.exceptions[0]
-        if error is group:
+        if len(group.exceptions) > 1:
             raise
+        error = innermost = group.exceptions[0]
+        while isinstance(innermost, BaseExceptionGroup) and len(innermost.exceptions) == 1:
+            innermost = innermost.exceptions[0]
+        if isinstance(innermost, KeyboardInterrupt):
+            error = innermost
     else:
         return
     raise_unchanged(error)

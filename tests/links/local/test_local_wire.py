@@ -407,7 +407,13 @@ async def expect(program: Program, pattern: str) -> str:
     return await anyio.to_thread.run_sync(program.output.expect, pattern)
 
 
-@pytest.mark.parametrize("younger", [False, pytest.param(True, marks=pytest.mark.thorough)], ids=["elder", "younger"])
+@pytest.mark.parametrize(
+    ("loopback", "younger"),
+    [
+        (False, False),
+        *(pytest.param(*case, marks=pytest.mark.thorough) for case in ((False, True), (True, False), (True, True))),
+    ],
+)
 async def test_the_end_of_a_killed_process_is_seen_and_its_name_removed(
     directory: str, loopback: bool, younger: bool
 ) -> None:

@@ -38,9 +38,9 @@ async def test_links_that_have_ended_are_freed_with_their_threads(address: str, 
             # The objects that all links share exist now.
             await join_for_a_moment(0)
             threads = threading.active_count()
-            for number in range(1, 11):
+            for number in range(1, 5):
                 await join_for_a_moment(number)
             gc.collect()
             assert len(ended) == 0
             assert threading.active_count() <= threads
-            assert own.statistics().frames == 11
+            assert own.statistics().frames == 5
