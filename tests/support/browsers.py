@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-PATIENCE = 8.0
+PATIENCE = 30.0
 """Seconds; drawing without a graphics card is slow."""
 _ARGUMENTS = (
     "--use-angle=swiftshader",

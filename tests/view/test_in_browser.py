@@ -14,7 +14,7 @@ import pytest
 from anyio.from_thread import BlockingPortal, start_blocking_portal
 from support.browsers import PATIENCE, browser
 from support.processes import new_domain
-from support.samples import moving, over, static
+from support.samples import moving, over
 
 from tfbus import LATEST, SECOND, Buffer, Bus, LocalLink, PointCloud, SimulatedClock, Transform, TransformStamped
 from tfbus.tree.history import EdgeState
@@ -95,14 +95,13 @@ class Window:
     def publish(self, *batch: TransformStamped) -> None:
         self.call(self.bus.publish, batch)
 
-    def until(self, condition: Callable[[], object]) -> None:
-        """Look again until a condition holds."""
+    def until(self, condition: Callable[..., object], *arguments: object) -> None:
+        """Look again until a condition holds for some arguments."""
         for _ in range(round(PATIENCE / 0.05)):
-            if condition():
+            if condition(*arguments):
                 return
             self.page.wait_for_timeout(50)
-        self.page.screenshot(path="/tmp/p40b/out/failed.png")
-        assert condition()
+        assert condition(*arguments)
 
     def row(self, frame: str) -> Any:
         """The row of a frame in the tree."""
@@ -124,7 +123,7 @@ class Window:
         return {name: Box(*box) for name, box in self.page.evaluate(script)}
 
     def pixels(self, *colours: str, near: int = 6) -> npt.NDArray[np.intp]:
-        """Where the picture has a colour, x and y in pixels of the canvas, shape (n, 2)."""
+        """The places at which the picture has a colour, x and y in pixels of the canvas, shape (n, 2)."""
         picture = np.asarray(Image.open(BytesIO(self.page.locator("main").screenshot())).convert("RGB"), int)
         wanted = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in colours])
         found = (np.abs(picture[:, :, None, :] - wanted).max(axis=3) <= near).any(axis=2)
@@ -338,7 +337,7 @@ def test_the_tree_is_filtered_by_patterns_and_grouped_by_the_prefixes_of_robots(
         ("", {"map", *both}),
     ):
         filtered.fill(pattern)
-        window.until(lambda wanted=wanted: window.names().keys() == wanted)
+        window.until(lambda wanted: window.names().keys() == wanted, wanted)
     window.page.locator("[role=treeitem].group", has_text="robot1/").locator(".eye").click()
     window.until(lambda: not any(name.startswith("robot1") for name in window.names()))
     window.page.get_by_role("button", name="Show all").click()
@@ -380,7 +379,7 @@ def test_time_is_always_in_sight_and_obeys_the_keys(window: Window) -> None:
         ("Home", "0.000"),
     ):
         page.keyboard.press(key)
-        window.until(lambda seconds=seconds: window.seconds() == seconds)
+        window.until(lambda text: window.seconds() == text, seconds)
     window.row("slow").click()
     page.keyboard.press("ArrowRight")
     window.until(lambda: window.seconds() == "2.000")
@@ -437,9 +436,7 @@ def test_a_phone_shows_picture_panel_and_time_together_in_light_and_dark(window:
     window.until(lambda: len(window.names()) > 3)
     sky = np.asarray(Image.open(BytesIO(page.locator("main").screenshot())).convert("L"), int)
     assert bool(sky.mean() < 80) is dark
-    page.get_by_role("button", name="Frames").tap() if page.evaluate("'ontouchstart' in window") else page.get_by_role(
-        "button", name="Frames"
-    ).click()
+    page.get_by_role("button", name="Frames").click()
     window.row("robot1/base").click()
     page.get_by_role("button", name="Selection", exact=True).click()
     window.until(lambda: window.facts().get("authority") == "test")
@@ -456,9 +453,10 @@ def test_every_control_has_a_name_for_screen_readers(window: Window) -> None:
     window.open(at("map", "base", 1.0, 0.0), edit=["base"])
     window.row("base").click()
     window.page.locator("#edit").wait_for()
-    nameless = """[...document.querySelectorAll('button, input, select, [role=tree], [role=treeitem]')].filter(each =>
-        !(each.getAttribute('aria-label') || each.textContent.trim() || [...(each.labels ?? [])].some(label => label.textContent.trim())))
-        .map(each => each.outerHTML)"""
+    nameless = """[...document.querySelectorAll('button, input, select, [role=tree], [role=treeitem]')].filter(each => {
+        const labels = [...(each.labels ?? [])].map(label => label.textContent);
+        return ![each.getAttribute('aria-label') ?? '', each.textContent, ...labels].join('').trim();
+    }).map(each => each.outerHTML)"""
     assert window.page.evaluate(nameless) == []
     assert window.page.get_by_role("slider", name="Time").count() == 1
     assert window.page.get_by_role("treeitem", name="base, static").get_attribute("aria-level") == "2"
@@ -525,7 +523,6 @@ def test_a_frame_is_moved_by_numbers_steps_and_a_handle_undone_and_saved(window:
         found: Transform = window.call(window.buffer.lookup_nowait, "base", "camera").transform
         return found
 
-    page = None
     window.open(
         at("map", "base", 3.0, 0.0, 0.0, 0.5),
         at("base", "camera", 0.3, 0.0, 0.4),
@@ -555,7 +552,7 @@ def test_a_frame_is_moved_by_numbers_steps_and_a_handle_undone_and_saved(window:
         arrow, origin = window.pixels("#ff0000", near=40).mean(axis=0), window.pixels("#0072b2").mean(axis=0)
         way = 60.0 * (arrow - origin) / np.linalg.norm(arrow - origin)
         window.drag(tuple(arrow), tuple(way))
-        window.until(lambda before=before: abs(pose().translation[0] - before[0]) > 0.005)
+        window.until(lambda x: abs(pose().translation[0] - x) > 0.005, before[0])
         x, *rest = np.subtract(pose().translation, before)
         assert rest == pytest.approx([0.0, 0.0], abs=1e-15)
         assert x / 0.01 == pytest.approx(round(x / 0.01))

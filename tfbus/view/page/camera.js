@@ -21,6 +21,7 @@ export class Camera {
     this.controls.addEventListener("change", () => scene.wake());
     this.strays = []; // Where frames have left the picture since it was framed.
     this.framed = 0; // The number of frames in the picture that was framed.
+    this.trails = 0;
     this.last = null; // Where the followed frame was.
     state.on("poses", () => this.#posesChanged());
     state.on("choices", () => {
@@ -28,6 +29,10 @@ export class Camera {
       this.#follow();
     });
     state.on("robot", () => !this.moved && this.fit());
+    state.on("trails", () => {
+      if (state.trails.size > this.trails && !this.moved && !state.follow) this.fit(this.strays);
+      this.trails = state.trails.size;
+    });
     new ResizeObserver(() => !this.moved && this.fit()).observe(canvas);
   }
 

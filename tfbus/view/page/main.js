@@ -83,6 +83,9 @@ byId("axes").addEventListener("input", ({ target }) => {
   scene.wake();
 });
 byId("robot").addEventListener("input", ({ target }) => scene.setOpacity(Number(target.value)));
+byId("more").addEventListener("click", ({ target }) => {
+  target.setAttribute("aria-pressed", target.getAttribute("aria-pressed") !== "true");
+});
 byId("fixed").addEventListener("click", () => connection.send("fixed", { frame: null }));
 byId("follow-end").addEventListener("click", () => state.choose({ follow: null }));
 state.on("robot", () => (byId("robot-control").hidden = false));

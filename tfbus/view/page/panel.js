@@ -37,6 +37,10 @@ export class Panel {
     state.on("states frames scale", () => this.#drawLegend());
     state.on("hello frames lost poses", () => this.#drawTrouble());
     state.on("note", () => this.#note(state.note));
+    state.on("robot", () => {
+      const { missing } = state.hello;
+      if (missing) this.#note(`${missing} meshes of the robot were not found: grey boxes stand for them (--package-path).`);
+    });
     this.#drawChoices();
     this.#drawLegend();
     this.#drawTrouble();

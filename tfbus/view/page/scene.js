@@ -100,13 +100,19 @@ export class Scene {
     this.state.tell("scale");
   }
 
-  // Spheres around all that is drawn: the frames, and the corners of the robot's shapes.
+  // Spheres around all that is drawn: the frames, their trails, and the corners of the robot's shapes.
   extent() {
     const found = [];
     this.state.names.forEach((_, place) => {
       if (this.state.drawn(place)) found.push({ centre: this.position(place), radius: 0 });
     });
     if (!found.length) return [];
+    for (const { points } of this.#trailList) {
+      for (let at = 0; at < points.length; at += 30) {
+        const centre = new THREE.Vector3().fromArray(points, at);
+        if (!Number.isNaN(centre.x)) found.push({ centre, radius: 0 });
+      }
+    }
     // A frame alone is a point: it is seen from a distance of a few axes.
     if (found.length === 1) found[0].radius = 0.5;
     for (const { solid } of this.#robot) {

@@ -5,6 +5,7 @@
 
 import { matcher, printable } from "./state.js";
 
+const DEEP = 7; // Below this level, the steps to the right are smaller.
 const FIRST_ROWS = 40; // The levels that are open at first have about so many rows.
 const collator = new Intl.Collator(undefined, { numeric: true });
 
@@ -150,7 +151,7 @@ export class Tree {
     const hidden = frames.every((frame) => state.hidden.has(frame));
     const selected = row.frame !== undefined && row.frame === state.selected;
     slot.style.transform = `translateY(${top}px)`;
-    slot.twist.style.marginLeft = `${14 * row.level}px`;
+    slot.twist.style.marginLeft = `${14 * Math.min(row.level, DEEP) + 4 * Math.max(row.level - DEEP, 0)}px`;
     setText(slot.twist, row.children ? (row.open ? "▾" : "▸") : "");
     setText(slot.name, printable(row.label));
     setText(slot.count, row.count ? `${row.count} frames` : "");
