@@ -31,7 +31,8 @@ links.rosbridge.protocol.MOST_TRANSFORMS links.rosbridge.protocol.QUEUE links.dd
 links.dds.dds_link._KEPT links.dds.readers.MOST_WAITING links.dds.readers.MOST_BYTES links.ros.settings._LAST_DOMAIN
 _aio.web_door.MAX_HEAD _aio.web_door.HEAD_TIME _aio.web_server.MAX_CONNECTIONS view.view._ORDERS
 view.session.EVENTS_KEPT view.session.SAMPLES view.session.MAX_TRAILS recording.points.MAX_POINTS
-view.session.MAX_MESSAGE view.meshes.MAX_BYTES view.meshes.MAX_NUMBERS view.meshes.MAX_VERTICES view.meshes.MAX_SHAPES plot.plots.SAMPLES plot.plots.LONGEST_NAME
+view.session.MAX_MESSAGE view.meshes.MAX_BYTES view.meshes.MAX_NUMBERS view.meshes.MAX_VERTICES view.meshes.MAX_SHAPES
+plot.plots.SAMPLES plot.plots.LONGEST_NAME
 """
 """The constants of the rows of the page, in their order."""
 
