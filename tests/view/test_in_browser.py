@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from io import BytesIO
@@ -97,7 +98,8 @@ class Window:
 
     def until(self, condition: Callable[..., object], *arguments: object) -> None:
         """Look again until a condition holds for some arguments."""
-        for _ in range(round(PATIENCE / 0.05)):
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
             if condition(*arguments):
                 return
             self.page.wait_for_timeout(50)
@@ -226,9 +228,9 @@ def test_the_names_of_few_frames_are_shown_and_of_many_the_first_twenty(window: 
 @thorough
 def test_the_camera_frames_what_there_is_until_somebody_moves_it(window: Window) -> None:
     window.open(at("map", "x", 5.0, 0.0), at("map", "y", 0.0, 5.0), at("map", "z", 0.0, 0.0, 3.0))
-    window.until(lambda: max(window.extent()) > 0.6)
+    window.until(lambda: max(window.extent()) > 0.45)
     window.publish(at("map", "far", 40.0, 9.0))
-    window.until(lambda: "far" in window.names() and max(window.extent()) > 0.6)
+    window.until(lambda: "far" in window.names() and max(window.extent()) > 0.45)
     window.drag((300.0, 500.0), (60.0, 0.0))
     window.page.wait_for_timeout(300)
     before = window.names()
@@ -237,7 +239,7 @@ def test_the_camera_frames_what_there_is_until_somebody_moves_it(window: Window)
     window.page.wait_for_timeout(300)
     assert window.names() == before
     window.page.get_by_role("button", name="Fit").click()
-    window.until(lambda: {"farther", "far"} <= window.names().keys() and max(window.extent()) > 0.6)
+    window.until(lambda: {"farther", "far"} <= window.names().keys() and max(window.extent()) > 0.45)
 
 
 @thorough
@@ -391,6 +393,10 @@ def test_time_is_always_in_sight_and_obeys_the_keys(window: Window) -> None:
     assert clock.endswith(".200") and clock.count(":") == 2
     page.keyboard.press(" ")
     window.until(lambda: window.pressed() == ["Play"] and float(window.seconds()) > 3.3)
+    page.get_by_role("button", name="Pause").click()
+    window.until(lambda: window.pressed() == ["Pause"])
+    page.keyboard.press(" ")
+    window.until(lambda: window.pressed() == ["Play"])
     page.keyboard.press(" ")
     window.until(lambda: window.pressed() == ["Pause"])
     box = page.locator("#slider").bounding_box()
@@ -549,9 +555,11 @@ def test_a_frame_is_moved_by_numbers_steps_and_a_handle_undone_and_saved(window:
         page.get_by_label("Axes of the handle").select_option(axes)
         before = pose().translation
         window.until(lambda: len(window.pixels("#ff0000", near=40)) > 20)
-        arrow, origin = window.pixels("#ff0000", near=40).mean(axis=0), window.pixels("#0072b2").mean(axis=0)
-        way = 60.0 * (arrow - origin) / np.linalg.norm(arrow - origin)
-        window.drag(tuple(arrow), tuple(way))
+        red = window.pixels("#ff0000", near=40)
+        tip = red[np.linalg.norm(red - np.median(red, axis=0), axis=1).argmax()]
+        way = tip - red[np.linalg.norm(red - tip, axis=1).argmax()]
+        way = way / np.linalg.norm(way)
+        window.drag(tuple(tip - 4.0 * way), tuple(60.0 * way))
         window.until(lambda x: abs(pose().translation[0] - x) > 0.005, before[0])
         x, *rest = np.subtract(pose().translation, before)
         assert rest == pytest.approx([0.0, 0.0], abs=1e-15)
@@ -601,7 +609,7 @@ def test_names_of_frames_are_texts_and_never_elements(window: Window) -> None:
     evil = "<img src=x onerror=document.title='owned'>"
     turned = "a\u202eb\nc"
     window.open(at(evil, turned, 1.0, 0.0), at(evil, f"{evil}{{1+1}}", 2.0, 0.0))
-    window.until(lambda: window.names().keys() == {evil, "a\\u{202e}b\\u{a}c", f"{evil}{{1+1}}"})
+    window.until(lambda: window.rows() == sorted([evil, "a\\u{202e}b\\u{a}c", f"{evil}{{1+1}}"]))
     window.row("a\\\\u{202e}b\\\\u{a}c").click()
     window.until(lambda: "parent" in window.facts())
     window.page.get_by_role("button", name="Fixed").click()

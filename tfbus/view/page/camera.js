@@ -4,7 +4,7 @@ import * as THREE from "./three/three.module.min.js";
 import { OrbitControls } from "./three/OrbitControls.js";
 
 const FROM = new THREE.Vector3(1, -0.9, 0.62).normalize(); // The direction from the frames to the camera.
-const MARGIN = 1.1;
+const MARGIN = 1.15;
 const EDGE = 36; // In pixels: the toolbar above and the legend below.
 const STRAYS = 200;
 const CLOSEST = 0.05; // In m, from the nearest frame.
@@ -39,7 +39,13 @@ export class Camera {
   // Frame all that is drawn, from the present direction, and where frames have left the picture before.
   fit(strays = []) {
     this.strays = strays;
-    const points = [...this.scene.extent(), ...strays];
+    // The first time for the length of the axes, the second time with the axes of a selected frame.
+    for (const axes of [0, 1.8]) this.#fit([...this.scene.extent(axes * this.scene.axesLength), ...strays]);
+    this.moved = false;
+    this.scene.wake();
+  }
+
+  #fit(points) {
     if (!points.length) return;
     const { camera, controls } = this;
     const back = this.framed ? camera.position.clone().sub(controls.target).normalize() : FROM.clone();
@@ -70,9 +76,7 @@ export class Camera {
     const farthest = Math.min(...points.map(({ centre, radius }) => centre.dot(back) - radius));
     controls.target.copy(camera.position).addScaledVector(back, (nearest + farthest) / 2 - distance);
     controls.update();
-    this.moved = false;
     this.scene.setScale(controls.target, camera.position.distanceTo(controls.target));
-    this.scene.wake();
   }
 
   #posesChanged() {

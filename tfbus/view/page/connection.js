@@ -62,7 +62,7 @@ export class Connection {
     if (!greeted) return;
     if (chosenFixed !== null) this.send("fixed", { frame: chosenFixed });
     if (selected !== null) this.send("select", { frame: selected });
-    for (const [frame, seconds] of trails) this.send("trail", { frame, on: true, seconds });
+    for (const [frame, { seconds }] of trails) this.send("trail", { frame, on: true, seconds });
     if (time.mode !== "live" && time.at !== null) {
       this.send("pause");
       this.send("seek", { ns: time.at });
@@ -133,12 +133,11 @@ export class Connection {
   }
 
   #takeTrails({ trails }, points) {
-    this.#state.trails = new Map(trails.map(({ frame, seconds }) => [frame, seconds]));
     let begin = 0;
     this.#scene.setTrails(
       trails.map(({ frame, count }) => ({ frame, points: points.subarray(begin, (begin += 3 * count)) })),
     );
-    this.#state.tell("trails");
+    this.#state.setTrails(trails);
   }
 
   #takeRobot(header, data, payload) {

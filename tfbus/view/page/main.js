@@ -89,6 +89,13 @@ byId("more").addEventListener("click", ({ target }) => {
 byId("fixed").addEventListener("click", () => connection.send("fixed", { frame: null }));
 byId("follow-end").addEventListener("click", () => state.choose({ follow: null }));
 state.on("robot", () => (byId("robot-control").hidden = false));
+
+// The keys belong to the picture again after a click or a choice with the pointer.
+let pointed = false;
+addEventListener("pointerdown", () => (pointed = true), true);
+addEventListener("keydown", () => (pointed = false), true);
+addEventListener("click", ({ target }) => pointed && target.closest("button")?.blur());
+addEventListener("change", ({ target }) => pointed && target.matches("select, [type=checkbox], [type=range]") && target.blur());
 addEventListener("keydown", (event) => {
   if (event.target.closest("input:not([type=range]), select")) return;
   if (event.ctrlKey || event.altKey || event.metaKey) return;

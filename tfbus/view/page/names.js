@@ -9,6 +9,7 @@ const FEW = 20;
 const GAP = 8; // From the dot to its name, in pixels.
 const HEIGHT = 17;
 const PADDING = 3;
+const LONG = 36; // A name with more letters is cut in the middle.
 
 export class Names {
   #labels = new Map(); // From name to its element.
@@ -37,7 +38,7 @@ export class Names {
       const middle = Math.min(Math.max(x - box[0] / 2, 0), width - box[0]);
       const corners = [0, -1, 1, -2, 2].flatMap((line) => {
         const top = y + line * (HEIGHT + 1) - HEIGHT / 2;
-        return [x + GAP, x - GAP - box[0], ...(line ? [middle] : [])].map((left) => [left, top]);
+        return [x + GAP, x - GAP - box[0], ...(line ? [middle] : [])].map((left) => [Math.round(left), Math.round(top)]);
       });
       const corner = corners.find(([left, top]) => {
         const right = left + box[0];
@@ -95,21 +96,26 @@ export class Names {
       let label = this.#labels.get(name);
       if (!label) {
         label = document.createElement("span");
-        label.textContent = printable(name);
+        label.textContent = short(name);
         this.container.append(label);
         this.#labels.set(name, label);
       }
       label.className = ["", "fixed", "chain", "selected"][rank];
-      label.style.transform = `translate(${Math.round(left)}px, ${Math.round(top)}px)`;
+      label.style.transform = `translate(${left}px, ${top}px)`;
     }
   }
 
   #width(name) {
     let width = this.#widths.get(name);
     if (width === undefined) {
-      width = Math.min(this.#pen.measureText(printable(name)).width, 240);
+      width = Math.min(Math.ceil(this.#pen.measureText(short(name)).width) + 1, 300);
       this.#widths.set(name, width);
     }
     return width;
   }
+}
+
+function short(name) {
+  const text = printable(name);
+  return text.length > LONG ? `${text.slice(0, LONG / 2 - 1)}…${text.slice(-LONG / 2)}` : text;
 }

@@ -147,8 +147,8 @@ export class Panel {
     const on = trails.has(selected);
     const box = byId("trail");
     if (performance.now() - (this.actions.trailAt ?? 0) > 500) box.checked = on;
-    if (on && document.activeElement !== byId("trail-seconds")) byId("trail-seconds").value = trails.get(selected);
-    byId("trail-colour").style.background = on ? TRAILS[[...trails.keys()].indexOf(selected) % TRAILS.length] : "none";
+    if (on && document.activeElement !== byId("trail-seconds")) byId("trail-seconds").value = trails.get(selected).seconds;
+    byId("trail-colour").style.background = on ? TRAILS[trails.get(selected).colour % TRAILS.length] : "none";
   }
 
   // From the selected frame to the measured one, in the axes of the selected one.

@@ -100,11 +100,12 @@ export class Scene {
     this.state.tell("scale");
   }
 
-  // Spheres around all that is drawn: the frames, their trails, and the corners of the robot's shapes.
-  extent() {
+  // Spheres around all that is drawn: the frames with axes of some length, their trails, and the corners of the robot's shapes.
+  extent(axes) {
     const found = [];
+    this.#placeRobot();
     this.state.names.forEach((_, place) => {
-      if (this.state.drawn(place)) found.push({ centre: this.position(place), radius: 0 });
+      if (this.state.drawn(place)) found.push({ centre: this.position(place), radius: axes });
     });
     if (!found.length) return [];
     for (const { points } of this.#trailList) {
@@ -114,7 +115,7 @@ export class Scene {
       }
     }
     // A frame alone is a point: it is seen from a distance of a few axes.
-    if (found.length === 1) found[0].radius = 0.5;
+    if (found.length === 1) found[0].radius = 0.5; // In m.
     for (const { solid } of this.#robot) {
       if (!solid.visible) continue;
       const { min, max } = solid.geometry.boundingBox;
@@ -318,14 +319,15 @@ export class Scene {
   }
 
   #drawTrails() {
-    const pieces = this.#trailList.flatMap(({ points }, trail) =>
-      Array.from({ length: Math.max(points.length / 3 - 1, 0) }, (_, k) => [points, 3 * k, trail]),
-    );
+    const pieces = this.#trailList.flatMap(({ frame, points }) => {
+      const colour = TRAIL_TINTS[(this.state.trails.get(frame)?.colour ?? 0) % TRAIL_TINTS.length];
+      return Array.from({ length: Math.max(points.length / 3 - 1, 0) }, (_, k) => [points, 3 * k, colour]);
+    });
     this.#trails.draw(pieces.length, (k, begin, finish, colour) => {
-      const [points, at, trail] = pieces[k];
+      const [points, at, tint] = pieces[k];
       begin.set(points.subarray(at, at + 3));
       finish.set(points.subarray(at + 3, at + 6));
-      colour.set(TRAIL_TINTS[trail % TRAIL_TINTS.length]);
+      colour.set(tint);
       return !Number.isNaN(begin[0] + finish[0]);
     });
   }

@@ -24,7 +24,7 @@ export class State {
   time = { mode: "live", at: null, start: null, end: null, speed: 1, now: "0" };
   timeHeard = 0; // In ms, as performance.now().
   details = NO_SELECTION;
-  trails = new Map(); // From frame to seconds.
+  trails = new Map(); // From frame to {seconds, colour}, the colour by its number.
   events = [];
 
   // From the person at this browser.
@@ -111,6 +111,20 @@ export class State {
       open.push(...this.below[place]);
     }
     return found;
+  }
+
+  // A trail keeps its colour, and a new one gets the first that is free.
+  setTrails(trails) {
+    const kept = new Map();
+    const used = trails.filter(({ frame }) => this.trails.has(frame)).map(({ frame }) => this.trails.get(frame).colour);
+    for (const { frame, seconds } of trails) {
+      let colour = this.trails.get(frame)?.colour ?? 0;
+      while (!this.trails.has(frame) && used.includes(colour)) colour++;
+      used.push(colour);
+      kept.set(frame, { seconds, colour });
+    }
+    this.trails = kept;
+    this.tell("trails");
   }
 
   setTime(time) {

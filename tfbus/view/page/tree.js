@@ -11,7 +11,7 @@ const collator = new Intl.Collator(undefined, { numeric: true });
 
 export class Tree {
   #rows = [];
-  #slots = [];
+  #slots = new Map(); // From the key of a row in sight to its element.
   #opened = new Map(); // From the key of a row to whether a person has opened it.
   #openLevels = 1;
 
@@ -48,28 +48,37 @@ export class Tree {
   #build() {
     const { state } = this;
     this.#openLevels = this.#firstLevels();
-    const matches = matcher(state.filter);
-    const filtered = state.filter.trim() !== "";
-    const wanted = new Uint8Array(state.names.length).fill(filtered ? 0 : 1);
-    if (filtered) {
-      state.names.forEach((name, place) => {
-        if (!matches(name)) return;
-        for (; place >= 0 && !wanted[place]; place = state.parents[place]) wanted[place] = 1;
-      });
-    }
+    this.#rows = /(^|\s)[^!\s]/.test(state.filter) ? this.#matchingRows() : this.#treeRows();
+    document.getElementById("only-chain").setAttribute("aria-pressed", state.onlyChain);
+    const shown = state.shown.reduce((sum, each) => sum + each, 0);
+    document.getElementById("shown-count").textContent =
+      shown === state.names.length ? `${shown} frames` : `${shown} of ${state.names.length} frames`;
+    this.#paint();
+  }
+
+  // The names that somebody looks for are a list; a filter that only excludes leaves the tree.
+  #matchingRows() {
+    const { names, filter, index } = this.state;
+    const found = names.filter(matcher(filter)).sort(collator.compare);
+    return found.map((frame) => ({
+      key: `f${frame}`, frame, place: index.get(frame), label: frame, level: 0, children: 0,
+    }));
+  }
+
+  #treeRows() {
+    const { state } = this;
     const counts = new Map();
     for (const name of state.names) counts.set(prefixOf(name), (counts.get(prefixOf(name)) ?? 0) + 1);
-    this.#rows = [];
+    const rows = [];
     const add = (row) => {
-      row.open = row.children > 0 && (filtered || this.#isOpen(row));
-      this.#rows.push(row);
+      row.open = row.children > 0 && this.#isOpen(row);
+      rows.push(row);
       return row.open;
     };
-    const walk = (places, level, prefix) => {
+    const walk = (places, level, prefix, above) => {
       const groups = new Map();
       const alone = [];
       for (const place of places) {
-        if (!wanted[place]) continue;
         const own = prefixOf(state.names[place]);
         if (own && own !== prefix && counts.get(own) > 1) groups.set(own, [...(groups.get(own) ?? []), place]);
         else alone.push(place);
@@ -78,24 +87,18 @@ export class Tree {
       for (const place of alone.sort(byName)) {
         const frame = state.names[place];
         const label = prefix && frame.startsWith(prefix) ? frame.slice(prefix.length) : frame;
-        const children = state.below[place].filter((each) => wanted[each]).length;
-        const row = { key: `f${frame}`, frame, place, label, level, children };
-        if (add(row)) walk(state.below[place], level + 1, prefixOf(frame) || prefix);
+        const row = { key: `f${frame}`, frame, place, label, level, children: state.below[place].length };
+        if (add(row)) walk(state.below[place], level + 1, prefixOf(frame) || prefix, frame);
       }
       for (const own of [...groups.keys()].sort(collator.compare)) {
         const places = groups.get(own).sort(byName);
-        const frames = places.flatMap((place) => state.branch(state.names[place]));
-        const count = frames.filter((frame) => wanted[state.index.get(frame)]).length;
-        const row = { key: `g${own} ${level}`, places, label: own, level, children: places.length, count };
-        if (add(row)) walk(places, level + 1, own);
+        const count = places.flatMap((place) => state.branch(state.names[place])).length;
+        const row = { key: `g${own}\n${above}`, places, label: own, level, children: places.length, count };
+        if (add(row)) walk(places, level + 1, own, above);
       }
     };
-    walk(state.roots, 0, "");
-    document.getElementById("only-chain").setAttribute("aria-pressed", state.onlyChain);
-    const shown = state.shown.reduce((sum, each) => sum + each, 0);
-    document.getElementById("shown-count").textContent =
-      shown === state.names.length ? `${shown} frames` : `${shown} of ${state.names.length} frames`;
-    this.#paint();
+    walk(state.roots, 0, "", "");
+    return rows;
   }
 
   // The number of levels that are open before a person opens one.
@@ -120,15 +123,21 @@ export class Tree {
     return parseFloat(getComputedStyle(this.panel).getPropertyValue("--row"));
   }
 
-  // Fill the rows in sight; their elements stay the same, so that a click is not lost.
+  // Fill the rows in sight; the element of a row stays the same, so that a click is not lost.
   #paint() {
     const height = this.#height;
     const first = Math.max(Math.floor(this.panel.scrollTop / height) - 3, 0);
-    const count = Math.min(Math.ceil(this.panel.clientHeight / height) + 6, this.#rows.length - first);
+    const seen = this.#rows.slice(first, first + Math.ceil(this.panel.clientHeight / height) + 6);
     this.list.style.height = `${this.#rows.length * height}px`;
-    while (this.#slots.length < count) this.#slots.push(this.#makeSlot());
-    while (this.#slots.length > count) this.#slots.pop().remove();
-    this.#slots.forEach((slot, k) => this.#fill(slot, this.#rows[first + k], (first + k) * height));
+    const slots = new Map(seen.map(({ key }) => [key, this.#slots.get(key) ?? this.#makeSlot()]));
+    for (const [key, slot] of this.#slots) if (!slots.has(key)) slot.remove();
+    this.#slots = slots;
+    seen.forEach((row, k) => this.#fill(slots.get(row.key), row, (first + k) * height));
+    // Readers of the screen want them in order.
+    [...slots.values()].reduceRight((next, slot) => {
+      if (slot.nextSibling !== next || !slot.isConnected) this.list.insertBefore(slot, next);
+      return slot;
+    }, null);
   }
 
   #makeSlot() {
@@ -140,7 +149,6 @@ export class Tree {
       slot.append((slot[part] = element));
     }
     slot.eye.tabIndex = -1;
-    this.list.append(slot);
     return slot;
   }
 
