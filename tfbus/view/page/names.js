@@ -6,6 +6,7 @@
 import { printable } from "./state.js";
 
 const FEW = 20;
+const AREA = 12_000; // In square pixels, for each name.
 const GAP = 8; // From the dot to its name, in pixels.
 const HEIGHT = 17;
 const PADDING = 3;
@@ -28,7 +29,7 @@ export class Names {
   draw() {
     this.#pen.font = getComputedStyle(this.container).font;
     const { clientWidth: width, clientHeight: height } = this.container;
-    const most = this.state.namesMode === "all" ? Infinity : FEW;
+    const most = this.state.namesMode === "all" ? Infinity : Math.min(FEW, (width * height) / AREA);
     const taken = [];
     const kept = new Map();
     for (const { name, x, y, rank } of this.#candidates()) {
@@ -36,7 +37,7 @@ export class Names {
       const box = [this.#width(name) + 2 * PADDING, HEIGHT];
       // To the right of its dot, or else to the left, or in the lines above and below; not beyond the picture.
       const middle = Math.min(Math.max(x - box[0] / 2, 0), width - box[0]);
-      const corners = [0, -1, 1, -2, 2].flatMap((line) => {
+      const corners = (rank ? [0, -1, 1, -2, 2] : [0, -1, 1]).flatMap((line) => {
         const top = y + line * (HEIGHT + 1) - HEIGHT / 2;
         return [x + GAP, x - GAP - box[0], ...(line ? [middle] : [])].map((left) => [Math.round(left), Math.round(top)]);
       });
