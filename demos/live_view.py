@@ -1,7 +1,8 @@
 """A robot to look at: a live page in the browser.
 
 A robot drives on a circle of 2 m at a quarter of a turn a second. On it turns a lidar, whose points the page draws in
-their frame. After ten seconds the odometry falls silent: the page shows the frame as stale.
+their frame. After ten seconds the odometry falls silent: the page shows the frame as stale. Click on the mount of the
+lidar, and move it: the lidar and its points follow, and *Save* writes the mount to `lidar_mount.yaml`.
 
 Run it with `python demos/live_view.py`, open the address that it prints, and press Ctrl-C to end it. It needs
 `pip install "tfbus[view]"`.
@@ -43,7 +44,8 @@ async def scan(bus: tfbus.Bus, view: View) -> None:
 
 async def main(port: int = 8080, clock: tfbus.Clock | None = None) -> None:
     with tfbus.Bus(clock) as bus, tfbus.Buffer(bus) as buffer:
-        async with View(bus, buffer, port, trails=["base_link"]) as view, anyio.create_task_group() as robot:
+        page = View(bus, buffer, port, trails=["base_link"], edit=["lidar_mount"], save="lidar_mount.yaml")
+        async with page as view, anyio.create_task_group() as robot:
             print(f"open {view.address}", flush=True)
             robot.start_soon(drive, bus)
             robot.start_soon(scan, bus, view)

@@ -76,7 +76,7 @@ def test_a_bus_says_why_it_cannot_be_copied_or_pickled() -> None:
 
 
 def test_rooms_with_extras_are_found_after_a_plain_import() -> None:
-    for room, extra in (("plot", "matplotlib"), ("view", "viser"), ("links", "anyio")):
+    for room, extra in (("plot", "matplotlib"), ("view", "trimesh"), ("links", "anyio")):
         pytest.importorskip(extra)
         assert getattr(tfbus, room) is import_module(f"tfbus.{room}")
 

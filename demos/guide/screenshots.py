@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import anyio
 import anyio.to_thread
@@ -24,7 +23,7 @@ from tfbus.recording import load
 from tfbus.view import View
 
 STATIC = Path(__file__).with_name("_static")
-SIZE = {"width": 1200, "height": 800}
+SIZE = {"width": 1280, "height": 800}
 COLOURS = 256
 
 
@@ -34,9 +33,14 @@ def write(name: str, picture: bytes) -> None:
     image.save(STATIC / name, optimize=True)
 
 
-def control(page: Page, name: str) -> Any:
-    """The input of a control of the page."""
-    return page.locator(f"xpath=//label[normalize-space()='{name}']/ancestor::div[2]//input[not(@type='hidden')]")
+def select(page: Page, frame: str) -> None:
+    """Select a frame in the tree of the page."""
+    page.get_by_label("Filter the frames by a pattern").fill(frame)
+    page.locator(f'[role=treeitem][title="{frame}"]').click()
+    page.get_by_label("Filter the frames by a pattern").fill("")
+    page.get_by_text("authority").wait_for()
+    # A name is marked under the pointer.
+    page.mouse.move(SIZE["width"] / 2, SIZE["height"] - 5)
 
 
 def photograph(address: str, name: str, prepare: Callable[[Page], None]) -> None:
@@ -49,11 +53,7 @@ def photograph(address: str, name: str, prepare: Callable[[Page], None]) -> None
         page = browser.new_page(viewport=SIZE)  # type: ignore[arg-type]
         page.set_default_timeout(120_000)
         page.goto(address)
-        page.wait_for_selector("text=are connected with")
-        # A note about missing graphics hardware, which is about the machine that makes the pictures.
-        note = page.get_by_text("Software WebGL rendering detected")
-        if note.count():
-            page.locator("[role=alert] button, .mantine-Notification-closeButton").first.click()
+        page.locator("[role=treeitem]").first.wait_for()
         prepare(page)
         page.wait_for_timeout(4_000)
         write(name, page.screenshot())
@@ -64,16 +64,9 @@ async def pr2(data: Path, packages: Path) -> None:
     """The PR2 of a recording, with the chain of its left gripper."""
 
     def prepare(page: Page) -> None:
-        control(page, "Search").fill("l_gripper_tool_frame")
-        page.wait_for_selector("text=l_gripper_palm_link")
-        control(page, "Time [s]").fill("3")
-        control(page, "Time [s]").press("Enter")
-        canvas = page.locator("canvas").first.bounding_box()
-        assert canvas is not None
-        page.mouse.move(canvas["x"] + canvas["width"] / 2, canvas["y"] + canvas["height"] / 2)
-        for _ in range(4):
-            page.mouse.wheel(0, -200)
-            page.wait_for_timeout(300)
+        select(page, "l_gripper_tool_frame")
+        page.get_by_label("Seconds from the start").fill("3.2")
+        page.keyboard.press("Enter")
 
     tree = load(data / "pr2_tf.bag")
     with tfbus.Bus() as bus, tfbus.Buffer(bus, keep=None, prefill=tree) as buffer:
@@ -85,8 +78,7 @@ async def tutorial() -> None:
     """The robot of the tf tutorial, live."""
 
     def prepare(page: Page) -> None:
-        control(page, "Search").fill("base_laser")
-        page.wait_for_selector("text=robot_tf_publisher")
+        select(page, "base_laser")
 
     with tfbus.Bus() as bus, tfbus.Buffer(bus) as buffer:
         async with View(bus, buffer, 0, rate=5.0) as view, anyio.create_task_group() as robot:

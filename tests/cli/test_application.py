@@ -40,7 +40,7 @@ NEED = "--connect and --listen need one more package:"
 DEFAULTS = {
     "check": f"10.0 {Limits().translation} {Limits().speed} {Limits().turn_rate} tf",
     "demo": "inf 100.0 1.0",
-    "view": "8080 127.0.0.1 30.0 tf",
+    "view": "frames.yaml 8080 127.0.0.1 30.0 tf",
 }
 
 
@@ -225,7 +225,7 @@ from importlib import import_module
 from tfbus.cli import run
 rooms, commands = json.loads(sys.argv[1])
 sys.modules.update(dict.fromkeys(["cyclonedds", "foxglove", "matplotlib", "mcap", "pyarrow", "ruamel"]))
-sys.modules.update(dict.fromkeys(["urdf_parser_py", "viser", "wsproto", "zenoh"]))
+sys.modules.update(dict.fromkeys(["urdf_parser_py", "trimesh", "wsproto", "zenoh"]))
 for room in rooms:
     try:
         import_module(f"tfbus.{room}")

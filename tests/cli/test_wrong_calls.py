@@ -13,7 +13,7 @@ from tfbus import SECOND
 
 START = 1_700_000_000 * SECOND
 ARM = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
-NEEDS = {"plot": "matplotlib", "view": "viser", "foxglove": "foxglove", "robot": "urdf_parser_py", "router": "zenoh"}
+NEEDS = {"plot": "matplotlib", "view": "trimesh", "foxglove": "foxglove", "robot": "urdf_parser_py", "router": "zenoh"}
 """The packages of the extras that commands need, by the names under which they are imported."""
 
 

@@ -497,46 +497,29 @@ def test_html_has_every_name_as_a_printable_text(name: str) -> None:
 def htmls_with(name: str) -> Iterator[str]:
     tree = tree_with([name])
     yield html_of(tree)
-    pytest.importorskip("viser", reason="the live page needs viser")
-    from tfbus.view.page import Page
-
-    page = Page(tree, fixed=name)
-    page.select(f"{name}'")
-    for event in get_args(Event):
-        hints = get_type_hints(event)
-        page.note_event(event(**{field.name: value_of(hints[field.name], name) for field in fields(event)}))
-    texts = page.texts(0, page.picture(0).scene)
-    yield from (texts.status, texts.selection, texts.tree, texts.events)
 
 
-@pytest.mark.anyio
-async def test_the_labels_and_the_options_of_the_page_are_printable_and_choose_the_frame() -> None:
-    pytest.importorskip("viser", reason="the live page needs viser")
-    from support.viser_pages import PageClient, on_page
+def test_the_page_is_told_every_name_and_takes_it_back_and_its_texts_are_printable() -> None:
+    pytest.importorskip("trimesh", reason="the live page needs trimesh")
+    from tfbus.view.session import MAX_MESSAGE, Page, Session
 
-    from tfbus.view import View
-    from tfbus.view.server import MAX_TEXT
-
-    tree = tree_with(NAMES)
-
-    def steps(page: PageClient) -> None:
-        page.wait_until(lambda: len(page.controls["Fixed frame"]["options"]) == 1 + len(tree.frames()))
-        options = page.controls["Fixed frame"]["options"][1:]
-        assert all(option.isprintable() for option in options)
-        for option in options:
-            if len(option) > MAX_TEXT:
-                # No browser may send so long a text.
-                continue
-            page.use("Frame", option, f'break-word">{option}</td>')
-            assert "is not known: " not in page.texts
-        page.send(page.update("Labels", "all"))
-
-        def labels() -> list[str]:
-            return [node["text"] for name, node in page.nodes.items() if name.startswith("/labels/")]
-
-        page.wait_until(lambda: len(labels()) >= 2 * len(NAMES))
-        assert all(label.isprintable() for label in labels())
-
-    with Bus() as bus, Buffer(bus, prefill=tree, keep=None) as buffer:
-        async with View(bus, buffer, 0, rate=1_000.0) as view:
-            await on_page(view, steps)
+    tree = tree_with([*NAMES, HALF])
+    page = Page(tree)
+    session = Session(page)
+    for name in NAMES:
+        for event in get_args(Event):
+            hints = get_type_hints(event)
+            page.note_event(event(**{field.name: value_of(hints[field.name], name) for field in fields(event)}))
+        told = [json.loads(text) for text in session.picture(0, 0) if isinstance(text, str)]
+        assert all(event["text"].isprintable() for each in told for event in each.get("events", ()))
+    told = [json.loads(text) for text in Session(page).picture(0, 0) if isinstance(text, str)]
+    [names] = [each["names"] for each in told if each["type"] == "frames"]
+    assert sorted(names) == sorted(tree.frames())
+    for name in names:
+        order = json.dumps({"do": "select", "frame": name})
+        if len(order) > MAX_MESSAGE:
+            continue
+        session.do(session.read(order))
+        [chosen] = [each for each in map(json.loads, session.picture(0, 0)) if each["type"] == "selection"]
+        assert chosen["frame"] == name
+        assert all(fact.isprintable() for fact in chosen["facts"].values())

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("viser", reason="the servers of all extras are looked at")
+pytest.importorskip("trimesh", reason="the servers of all extras are looked at")
 pytest.importorskip("foxglove", reason="the servers of all extras are looked at")
 pytest.importorskip("zenoh", reason="the servers of all extras are looked at")
 pytest.importorskip("cyclonedds", reason="the servers of all extras are looked at")

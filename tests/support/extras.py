@@ -13,7 +13,7 @@ EXTRAS = {
     "plot": ("matplotlib",),
     "rosbridge": ("cbor2", "wsproto"),
     "urdf": ("urdf_parser_py",),
-    "view": ("collada", "trimesh", "viser"),
+    "view": ("collada", "trimesh", "wsproto"),
     "web": ("fastapi", "uvicorn", "websockets"),
     "zenoh": ("zenoh",),
     "trio": ("trio",),

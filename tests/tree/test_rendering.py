@@ -258,7 +258,6 @@ def test_the_tree_has_a_line_with_the_facts_of_each_frame() -> None:
         "└── base       50.0 Hz  age 1 s  span 2 s  from 'odometry'",
         "    └── lidar  static  from 'driver'",
     ]
-    assert plain(to_html(TWO_EDGES, 0, with_facts=False)) == ["map", "└── base", "    └── lidar"]
     assert plain(to_html([], 0)) == ["(no frames)"]
 
 
@@ -273,11 +272,6 @@ def test_the_age_from_which_frames_are_stale_can_be_chosen_and_one_ahead_of_the_
     cases = ((5, 1.0, EdgeState.MOVING), (5, 0.9, EdgeState.STALE), (3, 0.1, EdgeState.MOVING))
     for now, stale_after, state in cases:
         assert f'color: {state.value}">base<' in to_html(TWO_EDGES, now * SECOND, stale_after)
-
-
-def test_marked_frames_stand_out() -> None:
-    lines = to_html(TWO_EDGES, 0, marked=("lidar",)).split("\n")
-    assert ["background" in line for line in lines] == [False, False, True]
 
 
 def test_names_and_authorities_cannot_become_elements() -> None:

@@ -1,7 +1,7 @@
 """Renderings of a tree: text for people, Graphviz, and tf2's YAML."""
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
@@ -204,16 +204,12 @@ def _label(text: str) -> str:
 
 
 _PRE = "font-family: monospace; font-size: 12px; line-height: 1.35; margin: 0; white-space: pre; overflow-x: auto"
-_MARK = "background: #f0e442; color: #000000"
 
 
 def to_html(
     edges: Sequence[Edge],
     now: int,
     stale_after: float = STALE_AFTER,
-    *,
-    marked: Collection[str] = (),
-    with_facts: bool = True,
 ) -> str:
     """The edges as an indented tree, one frame a line, each frame in the colour of its state.
 
@@ -224,29 +220,23 @@ def to_html(
         The stamp (ns) that ages are counted from.
     stale_after : float
         The age, in s, from which a moving frame is stale.
-    marked : collection of str
-        Frames to highlight.
-    with_facts : bool
-        Whether the rate, age, span and authority follow each frame.
 
     Returns
     -------
     str
         One ``<pre>`` element. All names are escaped, control characters too.
     """
-    drawn = [(guides, frame, printable(frame), edge) for guides, frame, edge in branches(edges)]
+    drawn = [(guides, printable(frame), edge) for guides, frame, edge in branches(edges)]
     if not drawn:
         return f'<pre style="{_PRE}">(no frames)</pre>'
-    width = max(len(guides + name) for guides, _, name, _ in drawn) + 2
+    width = max(len(guides + name) for guides, name, _ in drawn) + 2
     lines = []
-    for guides, frame, name, edge in drawn:
+    for guides, name, edge in drawn:
         style = "font-weight: bold"
         if edge is not None:
             style += f"; color: {state_of(edge, now, stale_after).value}"
-        if frame in marked:
-            style += f"; {_MARK}"
         line = f'{guides}<span style="{style}">{escape(name)}</span>'
-        if edge is not None and with_facts:
+        if edge is not None:
             line += " " * (width - len(guides + name)) + escape("  ".join(facts(edge, now).values()))
         lines.append(line)
     return f'<pre style="{_PRE}">{chr(10).join(lines)}</pre>'

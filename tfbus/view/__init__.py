@@ -1,7 +1,7 @@
 """The live 3D page: a `View` serves a page on which people see the frames of a buffer and move through its history.
 
-`page` decides on the content of a picture, without a browser and without an event loop. `screen` draws it with viser,
-and `server` starts viser behind a door. Needs ``pip install "tfbus[view]"``.
+`session` decides what each browser is sent, without a browser and without an event loop. `page/` has the files that the
+browser loads. Needs ``pip install "tfbus[view]"``.
 """
 
 from tfbus.errors import pip_install

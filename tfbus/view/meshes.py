@@ -23,6 +23,7 @@ import trimesh
 
 from tfbus.plain import printable
 from tfbus.robot.model import Box, Cylinder, Mesh, Shape, Sphere, Visual
+from tfbus.view.session import ROBOT, framed
 
 MAX_BYTES = 67_108_864
 """The greatest size in bytes of a mesh file and all files that it refers to, unpacked."""
@@ -38,8 +39,11 @@ _SPACE[list(b' \t\r\n\v\f,;/[]{}:<>="')] = True
 _CHUNK = 1_048_576
 _PLACEHOLDER = 0.05
 """In m: the side of the box that stands for a missing mesh."""
-_PLACEHOLDER_COLOUR = (204, 121, 167)
+_PLACEHOLDER_COLOUR = (150, 150, 150)
+_PLACEHOLDER_OPACITY = 0.35
 _NO_COLOUR = (190, 190, 190)
+# It tells of each texture that is not decoded, and without a handler Python would print that.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 class Triangles(NamedTuple):
@@ -135,6 +139,28 @@ def solids_of(visuals: Sequence[Visual], files: MeshFiles) -> list[Solid]:
     return solids
 
 
+def robot_message(solids: Sequence[Solid]) -> bytes:
+    """The shapes of a robot for the browsers, each mesh once; empty if there are none."""
+    meshes = {solid.key: solid.triangles for solid in solids}
+    places = {key: place for place, key in enumerate(meshes)}
+    header = {
+        "meshes": [{"vertices": len(each.vertices), "faces": len(each.faces)} for each in meshes.values()],
+        "solids": [
+            {
+                "mesh": places[solid.key],
+                "link": solid.visual.link,
+                "xyz": solid.visual.origin.translation,
+                "xyzw": solid.visual.origin.rotation,
+                "scale": solid.scale,
+                "colour": solid.colour,
+                "opacity": solid.opacity,
+            }
+            for solid in solids
+        ],
+    }
+    return framed(ROBOT, header, *(array for each in meshes.values() for array in each)) if solids else b""
+
+
 def _solid(visual: Visual, files: MeshFiles) -> Solid:
     shape = visual.shape
     own: tuple[int, int, int] | None = None
@@ -143,7 +169,9 @@ def _solid(visual: Visual, files: MeshFiles) -> Solid:
         found = files.read(shape.filename)
         if found is None:
             side = _PLACEHOLDER
-            return Solid(visual, "box", _unit(Box((1, 1, 1))), (side, side, side), _PLACEHOLDER_COLOUR, 0.6)
+            return Solid(
+                visual, "box", _unit(Box((1, 1, 1))), (side, side, side), _PLACEHOLDER_COLOUR, _PLACEHOLDER_OPACITY
+            )
         (triangles, own), key, scale = found, f"mesh {shape.filename}", shape.scale
     elif isinstance(shape, Box):
         triangles, key, scale = _unit(shape), "box", shape.size

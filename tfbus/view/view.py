@@ -1,52 +1,98 @@
 """`View`, the live 3D page of a bus.
 
-The program's event loop decides when to draw, and waits. viser's thread applies the choices of people, reads the tree
-and draws. All messages of browsers together cost the loop one wake-up a picture, and pictures take at most half of the
-time.
+Each browser has a websocket with a task of its own: it carries out the orders of a person, sends a picture, and rests
+at least as long as pictures take, so all browsers together use at most half of the program's time. While a browser is
+slow to read, no picture is made for it; the next one is of that moment. Threads read meshes and copy large trees.
 """
 
+import json
 import logging
 import os
+import shlex
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import anyio
 import anyio.abc
-import anyio.lowlevel
 import anyio.to_thread
 import numpy as np
 
-from tfbus._aio.loops import LoopWaker
 from tfbus._aio.task_groups import close_task_group
 from tfbus._aio.web_door import WebDoor
+from tfbus._aio.web_server import WebServer
+from tfbus._aio.web_site import WebFile, WebSite
+from tfbus._aio.websocket import WebSocket
 from tfbus.analysis.arrivals import Delays
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import OnceLogger
 from tfbus.data import PointCloud
-from tfbus.errors import BusClosedError
+from tfbus.errors import BusClosedError, TransformError
 from tfbus.events import FrameAdded
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import Batch
+from tfbus.recording.static_frames import save_static
 from tfbus.registration import AsyncOnly
 from tfbus.robot.model import read_visuals
-from tfbus.stamps import as_duration, is_real
+from tfbus.stamps import Latest, as_duration, is_real
 from tfbus.statistics import QueueStatistics
 from tfbus.tree.history import STALE_AFTER
-from tfbus.view.meshes import MeshFiles, Solid, solids_of
-from tfbus.view.page import Page
-from tfbus.view.screen import Points, Screen
-from tfbus.view.server import Controls, Server, start_server, stop_server
+from tfbus.tree.rendering import counted
+from tfbus.view.meshes import MeshFiles, robot_message, solids_of
+from tfbus.view.session import MAX_MESSAGE, Edit, Film, Message, Page, Points, Save, Session
 
+_FILES = Path(__file__).parent / "page"
+_MEDIA_TYPES = {
+    ".css": "text/css; charset=utf-8",
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
 _FEW = 100
 _DELAYS_EVERY = 500_000_000
 """ns."""
 _AT_LEAST_EVERY = 0.5
 """In s: the longest time between two pictures, because ages and stale frames change without any sample."""
+_ORDERS = 64
+"""The greatest number of orders of a browser that wait; beyond it, no more are read from its connection."""
+_AUTHORITY = "view"
+
+
+@runtime_checkable
+class _HasPeers(Protocol):
+    """A link."""
+
+    @property
+    def peers(self) -> tuple[str, ...]: ...
+
+    @property
+    def domain(self) -> object: ...
+
+
+class _Viewer:
+    """A browser that shows the page."""
+
+    def __init__(self, page: Page, socket: WebSocket) -> None:
+        self.session = Session(page)
+        self.socket = socket
+        self.orders: deque[Message] = deque()
+        self.stirred = anyio.Event()
+        self.has_room = anyio.Event()
+
+    async def read(self) -> None:
+        """Keep the orders of the browser until it is gone."""
+        with suppress(OSError):
+            while True:
+                self.orders.append(await self.socket.receive())
+                self.stirred.set()
+                while len(self.orders) >= _ORDERS:
+                    self.has_room = anyio.Event()
+                    await self.has_room.wait()
 
 
 class View(AsyncOnly):
@@ -54,7 +100,8 @@ class View(AsyncOnly):
 
     It shows the axes of every frame that is connected with the fixed frame, and a line to its parent in the colour of
     its state. A panel shows the facts about the selected frame, the tree, and events. Time can be stopped, moved and
-    played. All browsers show the same page. While no browser shows it, it neither draws nor listens.
+    played. Each browser has a selection, a time and a fixed frame of its own. While no browser shows it, it neither
+    draws nor listens.
 
     Parameters
     ----------
@@ -65,7 +112,7 @@ class View(AsyncOnly):
         The port of the page; if it is taken, the next free one; 0 for any.
     host : str
         The address to listen at. By default, only programs on this machine can connect; each program that can connect
-        sees and controls the page.
+        sees the page, and can move the frames that ``edit`` names.
     origins : iterable of str
         Other web pages that may use this one, such as ``https://robot.example:8443``; the page also answers to the
         names of their hosts. By default there are none, and it answers to addresses, to ``localhost``, to ``host`` and
@@ -84,6 +131,12 @@ class View(AsyncOnly):
         Whether the page starts with the newest samples. Otherwise it is for a recording: it starts at the oldest.
     stale_after : float
         A moving frame is shown as stale when its newest stamp is more than this many s behind the clock.
+    edit : iterable of str
+        Static frames that can be moved on the page. Each change is published on the bus, by the authority ``"view"``.
+    save : path, optional
+        The file to which the page can save these frames, as `tfbus.recording.save_static` does.
+    title : str
+        The title of the page.
 
     Attributes
     ----------
@@ -117,9 +170,13 @@ class View(AsyncOnly):
         rate: float = 30.0,
         live: bool = True,
         stale_after: float = STALE_AFTER,
+        edit: Iterable[str] = (),
+        save: str | os.PathLike[str] | None = None,
+        title: str = "tfbus",
     ) -> None:
-        if isinstance(trails, str):
-            raise TypeError(f"trails must be several names, not {trails!r}")
+        for name, frames in (("trails", trails), ("edit", edit)):
+            if isinstance(frames, str):
+                raise TypeError(f"{name} must be several names, not {frames!r}")
         if isinstance(port, bool) or not isinstance(port, int):
             raise TypeError(f"a port must be an int, not {port!r}")
         if not 0 <= port <= 65_535:
@@ -128,36 +185,32 @@ class View(AsyncOnly):
             raise TypeError(f"a rate must be a number in Hz, not {rate!r}")
         if not 0.0 < rate < float("inf"):
             raise ValueError(f"a rate must be greater than zero and finite, got {rate!r} Hz")
-        trails = tuple(trails)
-        for frame in trails if fixed is None else (*trails, fixed):
+        trails, edit = tuple(trails), tuple(edit)
+        for frame in (*trails, *edit, *(() if fixed is None else (fixed,))):
             check_frame(frame)
         self.bus = bus
         self.address: str = ""
         self._buffer = buffer
-        self._host, self._port = host, port
-        self._door = WebDoor(host, origins)
         self._urdf = urdf
         self._package_paths = tuple(Path(path) for path in package_paths)
         self._period = 1.0 / rate
-        self._page_options = (fixed, trails, live, as_duration(stale_after, "stale_after"))
-        self._stale_after = self._page_options[3]
-        self._points: dict[str, Points] = {}
+        self._stale_after = as_duration(stale_after, "stale_after")
+        self._save = None if save is None else Path(save).absolute()
+        hello = {"title": title, "save": save and str(self._save)}
+        self._page = Page(buffer.tree, fixed, trails, live, self._stale_after, edit, hello)
         self._log = OnceLogger(logging.getLogger("tfbus"))
-        self._controls = Controls(lambda: self._changed.set())
-        self._changed = anyio.Event()
-        self._drawn = anyio.Event()
-        self._drawn_waker = LoopWaker(lambda: self._drawn.set())
-        self._drawn_at = time.monotonic_ns()
-        self._texts_wanted = True
+        self._viewers: set[_Viewer] = set()
+        self._viewers_changed = anyio.Event()
+        self._refused = 0
         self._entered = False
-        self._page: Page
-        self._screen: Screen
-        self._server: Server | None = None
+        self._files: dict[str, WebFile] = {}
+        site = WebSite(self._files, self._serve, MAX_MESSAGE)
+        self._server = WebServer(host, port, WebDoor(host, origins), site.answer, search=True)
         self._tasks: anyio.abc.TaskGroup
 
     def add_points(
         self,
-        cloud: PointCloud,
+        cloud: PointCloud | Sequence[PointCloud],
         name: str = "points",
         *,
         size: float = 0.02,
@@ -170,7 +223,9 @@ class View(AsyncOnly):
 
         Parameters
         ----------
-        cloud : PointCloud
+        cloud : PointCloud, or sequence of PointCloud
+            Of several clouds, all with a stamp, the newest up to the moment shown; none that is older than
+            `stale_after`.
         name : str
         size : float
             The size of each point, in m.
@@ -180,17 +235,23 @@ class View(AsyncOnly):
         Raises
         ------
         TypeError, ValueError
-            If `cloud` is not a cloud, the size is not greater than zero, or the colour has another shape.
+            If `cloud` is not a cloud, the size is not greater than zero, the colour has another shape, or one of
+            several clouds has no stamp.
         """
-        if not isinstance(cloud, PointCloud):
-            raise TypeError(f"expected a PointCloud, not {cloud!r}")
+        several = isinstance(cloud, Sequence)
+        clouds = tuple(cloud) if isinstance(cloud, Sequence) else (cloud,)
+        for each in clouds:
+            if not isinstance(each, PointCloud):
+                raise TypeError(f"expected a PointCloud, not {each!r}")
+            if several and isinstance(each.stamp, Latest):
+                raise ValueError("each of several clouds needs a stamp, not LATEST")
         if not is_real(size):
             raise TypeError(f"a size must be a number of m, not {size!r}")
         if not 0.0 < size < float("inf"):
             raise ValueError(f"a size must be greater than zero and finite, got {size!r}")
-        # A new dict, because viser's thread may be reading the old one.
-        self._points = {**self._points, name: Points(cloud, float(size), _as_colours(colour, len(cloud)))}
-        self._changed.set()
+        points = [Points(each, float(size), _as_colours(colour, len(each))) for each in clouds]
+        self._page.clouds[name] = Film(points, self._stale_after) if several else points[0]
+        self._change()
 
     def remove_points(self, name: str = "points") -> None:
         """Remove points.
@@ -200,25 +261,23 @@ class View(AsyncOnly):
         KeyError
             If there are none of this name.
         """
-        points = dict(self._points)
-        del points[name]
-        self._points = points
-        self._changed.set()
+        del self._page.clouds[name]
+        self._change()
 
     @property
     def viewers(self) -> int:
         """The number of browsers that show the page."""
-        return 0 if self._server is None else len(self._server.get_clients())
+        return len(self._viewers)
 
     @property
     def refused(self) -> int:
-        """Refused: requests of other pages, messages that this page does not send, connections beyond 100 at once."""
-        server = self._server
-        return self._door.refused + (server.refused + server.refused_connections if server is not None else 0)
+        """Refused: requests of other pages, orders that cannot be carried out, connections beyond 100 at once."""
+        return self._server.refused + self._refused
 
     def statistics(self) -> QueueStatistics:
-        """The counters of people's changes on the page; of each control, a picture shows the newest value."""
-        return self._controls.statistics()
+        """The counters of people's orders; a browser with too many has to wait, so none is dropped."""
+        pending = sum(len(viewer.orders) for viewer in self._viewers)
+        return QueueStatistics("orders", "wait", _ORDERS * max(1, self.viewers), pending, 0)
 
     async def __aenter__(self) -> Self:
         if self._entered:
@@ -227,104 +286,139 @@ class View(AsyncOnly):
         if self.bus.closed:
             raise BusClosedError
         self._entered = True
+        await anyio.to_thread.run_sync(self._read_files)
+        await self._server.__aenter__()
+        self._tasks = await anyio.create_task_group().__aenter__()
         self.bus._entered.add(self)
-        self._controls.bind()
-        self._drawn_waker.bind()
-        fixed, trails, live, stale_after = self._page_options
-        self._page = Page(self._buffer.tree, fixed, trails, live, stale_after)
-        # A cancellation must not lose the server that a thread has started.
-        with anyio.CancelScope(shield=True):
-            solids = await anyio.to_thread.run_sync(self._read_solids)
-            server = self._server = await anyio.to_thread.run_sync(start_server, self._host, self._port, self._door)
-        try:
-            self._screen = Screen(server, self._page, solids, self._controls)
-            server.on_client_connect(self._client_changed)
-            server.on_client_disconnect(self._client_changed)
-            self.address = f"http://{f'[{self._host}]' if ':' in self._host else self._host}:{server.get_port()}"
-            self._tasks = await anyio.create_task_group().__aenter__()
-            self._tasks.start_soon(self._run)
-        except BaseException:
-            await self._stop()
-            raise
+        self.address = f"http://{self._server.place}"
+        self._tasks.start_soon(self._listen)
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        self.address = ""
+        self.bus._entered.discard(self)
         self._tasks.cancel_scope.cancel()
         try:
             await close_task_group(self._tasks)
         finally:
-            await self._stop()
+            await self._server.__aexit__(None, None, None)
 
-    async def _stop(self) -> None:
-        self.address = ""
-        self.bus._entered.discard(self)
-        server, self._server = self._server, None
-        if server is not None:
-            with anyio.CancelScope(shield=True):
-                await anyio.to_thread.run_sync(stop_server, server)
+    def _read_files(self) -> None:
+        for path in sorted(_FILES.rglob("*")):
+            if path.is_file():
+                media_type = _MEDIA_TYPES.get(path.suffix, "text/plain; charset=utf-8")
+                self._files[f"/{path.relative_to(_FILES).as_posix()}"] = WebFile(media_type, path.read_bytes())
+        if "/index.html" in self._files:
+            self._files["/"] = self._files["/index.html"]
+        if self._urdf is not None:
+            text = isinstance(self._urdf, str) and "<" in self._urdf
+            files = MeshFiles(self._package_paths, Path() if text else Path(self._urdf).parent)
+            self._page.robot = robot_message(solids_of(read_visuals(self._urdf), files))
+            self._page.hello["missing"] = len(files.missing)
 
-    def _read_solids(self) -> list[Solid]:
-        if self._urdf is None:
-            return []
-        text = isinstance(self._urdf, str) and "<" in self._urdf
-        files = MeshFiles(self._package_paths, Path() if text else Path(self._urdf).parent)
-        return solids_of(read_visuals(self._urdf), files)
-
-    async def _run(self) -> None:
-        while True:
-            self._changed = anyio.Event()
-            if self.viewers:
-                await self._show()
-            else:
-                await self._changed.wait()
-
-    async def _show(self) -> None:
-        """Draw until no browser shows the page."""
-        async with anyio.create_task_group() as tasks:
-            with self._listening():
-                tasks.start_soon(self._note_events)
-                self._drawn_at = time.monotonic_ns()
-                while self.viewers:
-                    self._changed = anyio.Event()
-                    before = time.monotonic()
-                    await self._draw()
-                    # The program has work of its own.
-                    await anyio.sleep(max(self._period, time.monotonic() - before))
-                    if not self._page.timeline.playing:
-                        with anyio.move_on_after(_AT_LEAST_EVERY):
-                            await self._changed.wait()
-            tasks.cancel_scope.cancel()
-
-    async def _draw(self) -> None:
-        """Have viser's thread draw the page, and wait until it has."""
-        assert self._server is not None
-        drawn = self._drawn = anyio.Event()
-        texts, self._texts_wanted = self._texts_wanted, False
-        now, points = self.bus.clock.now(), self._points
+    async def _serve(self, socket: WebSocket) -> None:
+        """Show the page in one browser, until it is gone."""
+        viewer = _Viewer(self._page, socket)
+        self._viewers.add(viewer)
+        self._viewers_changed.set()
         try:
-            self._server.get_event_loop().call_soon_threadsafe(self._draw_now, now, points, texts)
-        except RuntimeError as error:
-            self._warn(error)
-        else:
-            await drawn.wait()
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(self._show, viewer)
+                await viewer.read()
+                tasks.cancel_scope.cancel()
+        finally:
+            self._viewers.discard(viewer)
+            self._viewers_changed.set()
 
-    def _draw_now(self, now: int, points: Mapping[str, Points], texts: bool) -> None:
-        """Draw the page; called in viser's thread."""
+    async def _show(self, viewer: _Viewer) -> None:
+        with suppress(OSError):
+            while True:
+                viewer.stirred = anyio.Event()
+                begin = time.monotonic()
+                messages = await self._messages(viewer)
+                spent = time.monotonic() - begin
+                for message in messages:
+                    await viewer.socket.send(message)
+                # The program has work of its own.
+                await anyio.sleep(max(self._period, (2 * len(self._viewers) - 1) * spent))
+                if not viewer.session.timeline.playing:
+                    with anyio.move_on_after(_AT_LEAST_EVERY):
+                        await viewer.stirred.wait()
+
+    async def _messages(self, viewer: _Viewer) -> list[Message]:
+        """Carry out the orders that wait now; the answers to them, and the picture after them."""
+        messages: list[Message] = []
+        for _ in range(len(viewer.orders)):
+            answer = await self._obey(viewer.session, viewer.orders.popleft())
+            if answer is not None:
+                messages.append(answer)
+        viewer.has_room.set()
+        self._greet()
         try:
-            elapsed = time.monotonic_ns()
-            self._page.timeline.advance((elapsed - self._drawn_at) / 1e9)
-            self._drawn_at = elapsed
-            self._screen.draw(now, elapsed, points, texts)
+            messages += viewer.session.picture(self.bus.clock.now(), time.monotonic_ns())
         except Exception as error:  # noqa: BLE001 - a picture that fails must not end the program that it is of
-            self._warn(error)
-        # The event loop may have ended before the server.
-        with suppress(RuntimeError):
-            self._drawn_waker.wake()
+            self._log.warning((type(error), str(error)), "the page could not be drawn: %r", error)
+        return messages
 
-    def _warn(self, error: Exception) -> None:
-        self._log.warning((type(error), str(error)), "the page could not be drawn: %r", error)
+    async def _obey(self, session: Session, text: Message) -> str | None:
+        """Carry out an order; the answer to the browser, if there is one."""
+        try:
+            order = session.read(text)
+            if session.needs_history(order):
+                session.hold(await anyio.to_thread.run_sync(self._page.tree.copy))
+            wish = session.do(order)
+            if isinstance(wish, Edit):
+                self.bus.publish(wish.sample(self.bus.clock.now(), _AUTHORITY))
+            elif isinstance(wish, Save):
+                return json.dumps({"type": "saved", **await self._save_edited()})
+        except Exception as error:  # noqa: BLE001 - an order of a stranger must not end the program
+            self._refused += 1
+            if not isinstance(error, ValueError | TypeError | ArithmeticError | TransformError | OSError):
+                self._log.warning((type(error), str(error)), "an order of a browser failed: %r", error)
+            return json.dumps({"type": "error", "text": str(error)})
+        return None
+
+    async def _save_edited(self) -> dict[str, object]:
+        if self._save is None:
+            raise ValueError("the program names no file to save to: give the view save=, or tfbus view --save")
+        samples = [edit.sample(0, _AUTHORITY) for edit in self._page.edited()]
+        if not samples:
+            raise ValueError(f"none of the frames that can be moved is there: {', '.join(self._page.edit) or 'none'}")
+        await anyio.to_thread.run_sync(save_static, self._save, samples)
+        return {"path": str(self._save), "frames": [sample.child for sample in samples]}
+
+    def _greet(self) -> None:
+        """Tell the browsers which domain is shown, who is heard there, and how a frame is sent to it."""
+        links = [each for each in self.bus._entered if isinstance(each, _HasPeers)]
+        named = [link.domain for link in links if isinstance(link.domain, str)]
+        option = f" --domain {shlex.quote(named[0])}" if named and named[0] != "tf" else ""
+        self._page.hello |= {
+            "where": " and ".join(f"domain {link.domain!r}" for link in links),
+            "hears": counted(sum(len(link.peers) for link in links), "peer") if links else "",
+            "send": f"tfbus static map base --xyz 1 0 0{option}" if named and self._page.live else "",
+        }
+
+    def _change(self) -> None:
+        """Have every browser get another picture."""
+        for viewer in self._viewers:
+            viewer.stirred.set()
+
+    async def _listen(self) -> None:
+        """Listen to the bus while somebody looks."""
+        while True:
+            self._viewers_changed = anyio.Event()
+            if self._viewers:
+                async with anyio.create_task_group() as tasks:
+                    with self._listening():
+                        tasks.start_soon(self._note_events)
+                        while self._viewers:
+                            self._viewers_changed = anyio.Event()
+                            await self._viewers_changed.wait()
+                    tasks.cancel_scope.cancel()
+            else:
+                await self._viewers_changed.wait()
 
     @contextmanager
     def _listening(self) -> Iterator[None]:
@@ -342,11 +436,11 @@ class View(AsyncOnly):
             elif now >= due:
                 due = now + _DELAYS_EVERY
                 delays.note(batch, self.bus.clock.now())
-            self._changed.set()
+            self._change()
 
         def removed(frame: str) -> None:
             delays.forget(frame)
-            self._changed.set()
+            self._change()
 
         with ExitStack() as stack:
             if not self.bus.closed:
@@ -356,7 +450,8 @@ class View(AsyncOnly):
             yield
 
     async def _note_events(self) -> None:
-        if self.bus.closed:
+        # The events of a recording would be those of moved frames, at the time of now.
+        if self.bus.closed or not self._page.live:
             return
         known = self.bus.statistics().frames
         with self.bus.events(stale_after=self._stale_after) as events:
@@ -366,12 +461,7 @@ class View(AsyncOnly):
                     known -= 1
                     continue
                 self._page.note_event(event)
-                self._texts_wanted = True
-                self._changed.set()
-
-    def _client_changed(self, _: object) -> None:
-        self._texts_wanted = True
-        self._controls.wake()
+                self._change()
 
 
 def _as_colours(colour: Any, count: int) -> Any:

@@ -6,7 +6,7 @@ from typing import Any
 import httpx
 import pytest
 
-pytest.importorskip("viser", reason="the live page needs viser")
+pytest.importorskip("trimesh", reason="the live page needs trimesh")
 
 from support.commands import Command, check_wrong_call
 from support.processes import free_address, new_domain, start_tfbus
@@ -56,5 +56,5 @@ def test_a_recording_is_no_live_page_and_has_the_options_of_the_command(
     check_wrong_call(tfbus("view", recording, *options.split()), "cannot use port 8081: in use")
     (given,) = asked
     named = {"origins": ("https://robot.example",), "fixed": "map", "trails": ("base",), "rate": 5.0, "live": False}
-    by_default = {"host": "127.0.0.1", "urdf": None, "package_paths": ()}
+    by_default = {"host": "127.0.0.1", "urdf": None, "package_paths": (), "edit": (), "save": None, "title": "run.mcap"}
     assert given == {"port": 8081, "edges": 1, **named, **by_default}

@@ -110,6 +110,17 @@ class MessageTypes:
             raise ValueError(f"{kind!r} is not the name of a type of ROS")
         return f"{package.removesuffix('/msg')}/msg/{last}"
 
+    def read(self, channel: Channel, payload: bytes) -> object:
+        """The message of a payload, as an object with its fields; raises `ValueError` as `convert`."""
+        # Only the conversion knows of the sequence number in a header of ROS 1.
+        cdr = self.convert(channel, payload) if channel.encoding == "ros1" else payload
+        self._register(channel)
+        try:
+            found: object = self._store.deserialize_cdr(cdr, self.name(channel.type))
+        except Exception as error:  # noqa: BLE001
+            raise ValueError(f"a message of type {channel.type} cannot be read: {error!r}"[:200]) from None
+        return found
+
     def convert(self, channel: Channel, payload: bytes) -> bytes:
         """A payload in the other of the two encodings.
 
