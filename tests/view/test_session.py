@@ -10,7 +10,16 @@ from hypothesis import strategies as st
 from support.samples import moving, over, static, tree_of
 from support.shown_pages import Shown
 
-from tfbus import LATEST, SECOND, PointCloud, Transform, TransformStamped, TransformTree
+from tfbus import (
+    LATEST,
+    SECOND,
+    Covariance,
+    PointCloud,
+    Transform,
+    TransformStamped,
+    TransformTree,
+    UncertainSample,
+)
 from tfbus.events import FrameLive, FrameRemoved, PeerLost
 from tfbus.view.session import EVENTS_KEPT, MAX_TRAILS, Edit, Film, Page, Points, Save, Session
 
@@ -193,6 +202,15 @@ def test_a_step_goes_to_the_nearest_sample_of_a_frame_or_of_any() -> None:
 
 
 # The selection, trails, events
+
+
+def test_a_selection_has_the_ellipsoid_of_its_error_if_an_edge_has_told_one() -> None:
+    error = Covariance.of(xyz=(0.1, 0.2, 0.3))
+    tree = tree_of(UncertainSample("map", "base", 0, Transform((1, 0, 0)), covariance=error), static("base", "lidar"))
+    browser = Browser(tree)
+    axes, turned = browser.do("select", frame="lidar").said["selection"]["ellipsoid"]
+    assert (axes, turned) == (pytest.approx([0.2, 0.4, 0.6]), pytest.approx([0, 0, 0, 1]))
+    assert browser.do("select", frame="map").said["selection"]["ellipsoid"] is None
 
 
 def test_the_facts_of_a_selection_are_its_pose_and_the_edge_above_it() -> None:

@@ -16,7 +16,8 @@ type          content
 ``states``    a word of `_STATES` for each of these names
 ``clouds``    the names of the points
 ``time``      the mode, the stamp that is shown, the span; at least twice a second, as a sign of life
-``selection`` the facts about the selected frame, its chain, and its pose in its parent
+``selection`` the facts about the selected frame, its chain, its pose in its parent, and the semi-axes and the
+              quaternion of the ellipsoid of two sigma in the fixed frame, if the error of its position is known
 ``edited``    the pose in its parent of a frame that can be moved; when it has changed
 ``events``    new events
 ``error``     the reason why an order was refused
@@ -48,7 +49,7 @@ from tfbus.events import Event
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform, from_row
 from tfbus.plain import printable
-from tfbus.rows import Row
+from tfbus.rows import Quaternion, Row, Vector
 from tfbus.stamps import (
     LATEST,
     SECOND,
@@ -233,6 +234,12 @@ def _pose_facts(tree: TransformTree, fixed: str | None, frame: str, at: int | La
         "quaternion": f"{_join(transform.rotation)} (x y z w)",
         "at": "any time" if found.static else format_stamp(found.stamp),
     }
+
+
+def _ellipsoid(tree: TransformTree, fixed: str, frame: str, at: int | Latest) -> tuple[Vector, Quaternion] | None:
+    """The ellipsoid of two sigma around a frame; None if no edge has told its error."""
+    found = tree.lookup(fixed, frame, at, covariance=True).ellipsoid()
+    return found if any(found[0]) else None
 
 
 def _edge_facts(edge: Edge | None, now: int, delay: float | None) -> dict[str, str]:
@@ -824,7 +831,7 @@ class Session:
         frame, fixed, at = self._selected, self._fixed, LATEST if stamp is None else stamp
         facts: dict[str, str] = {}
         chain: list[str] = []
-        parent = own = None
+        parent = own = ellipsoid = None
         if frame is not None:
             facts = selection_facts(self._tree, fixed, frame, at, then, self._page.delays.get(frame))
             forest = forest_of(self._tree)
@@ -833,8 +840,10 @@ class Session:
                 parent = None if history is None else _parent(history, at)
             with suppress(TransformLookupError):
                 own = None if parent is None else self._tree.lookup(parent, frame, at).transform
-            with suppress(TransformLookupError):
-                chain = [] if fixed is None else list(reversed(self._tree.chain(fixed, frame, at)))
+            if fixed is not None:
+                with suppress(TransformLookupError):
+                    chain = list(reversed(self._tree.chain(fixed, frame, at)))
+                    ellipsoid = _ellipsoid(self._tree, fixed, frame, at)
         yield from self._text(
             "selection",
             frame=frame,
@@ -843,6 +852,7 @@ class Session:
             parent=parent,
             xyz=None if own is None else own.translation,
             xyzw=None if own is None else own.rotation,
+            ellipsoid=ellipsoid,
         )
         for edit in self._page.edited():
             xyz, xyzw = edit.transform.translation, edit.transform.rotation

@@ -63,6 +63,7 @@ export class Panel {
     };
     byId("trail").addEventListener("change", trail);
     byId("trail-seconds").addEventListener("change", () => byId("trail").checked && trail());
+    byId("ellipsoids").addEventListener("change", ({ target }) => state.choose({ ellipsoids: target.checked }));
     byId("follow").addEventListener("change", ({ target }) => {
       const follow = target.value && { frame: state.selected, heading: target.value === "heading" };
       state.choose({ follow: follow || null });
@@ -113,7 +114,9 @@ export class Panel {
   }
 
   #drawFacts() {
-    const { facts } = this.state.details;
+    const { facts, ellipsoid } = this.state.details;
+    byId("ellipsoid").hidden = !ellipsoid;
+    if (ellipsoid) byId("ellipsoid-size").textContent = ellipsoid[0].map((axis) => axis.toPrecision(2)).join(" × ");
     const rows = Object.entries(facts).filter(([label]) => label !== "frame" && label !== "chain");
     const list = byId("facts");
     // The elements stay, so that a person can mark and copy a text.

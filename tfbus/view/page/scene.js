@@ -35,6 +35,10 @@ export class Scene {
   #trails = new Lines(2.2);
   #measure = new Lines(2);
   #dots = new Dots();
+  #ellipsoid = new THREE.Mesh(
+    new THREE.SphereGeometry(1, 32, 16),
+    new THREE.MeshBasicMaterial({ color: "#e69f00", transparent: true, opacity: 0.3, depthWrite: false }),
+  );
   #axes = null;
   #grid = null;
   #gridColour = "#888888";
@@ -59,13 +63,13 @@ export class Scene {
       sun.position.set(2, -3, 5);
       scene.add(sun);
     }
-    this.frames.add(this.#chain, this.#edges, this.#trails, this.#measure, this.#dots);
+    this.frames.add(this.#chain, this.#edges, this.#trails, this.#measure, this.#dots, this.#ellipsoid);
     new ResizeObserver(() => this.#resize()).observe(canvas);
     const dark = matchMedia("(prefers-color-scheme: dark)");
     dark.addEventListener("change", () => this.#setColours());
     this.#setColours();
     this.#resize();
-    state.on("poses frames states selected hovered choices trails", () => this.wake());
+    state.on("poses frames states selected details hovered choices trails", () => this.wake());
   }
 
   // Draw soon.
@@ -315,6 +319,7 @@ export class Scene {
       return true;
     });
     this.#drawTrails();
+    this.#drawEllipsoid();
     state.clouds.forEach((name, k) => this.#placeRow(this.#clouds.get(name), state.names.length + k));
   }
 
@@ -330,6 +335,20 @@ export class Scene {
       colour.set(tint);
       return !Number.isNaN(begin[0] + finish[0]);
     });
+  }
+
+  // Two sigma of the position of the selected frame.
+  #drawEllipsoid() {
+    const { details, selected, ellipsoids, index } = this.state;
+    const place = index.get(selected);
+    const known = ellipsoids && details.frame === selected && details.ellipsoid && this.state.drawn(place);
+    this.#ellipsoid.visible = Boolean(known);
+    if (!known) return;
+    const [axes, turned] = details.ellipsoid;
+    this.#ellipsoid.position.copy(this.position(place));
+    this.#ellipsoid.quaternion.set(...turned);
+    // A sphere that is flat has no inside.
+    this.#ellipsoid.scale.set(...axes.map((axis) => Math.max(axis, 1e-6)));
   }
 
   #placeRow(object, row) {

@@ -2,7 +2,7 @@
 //
 // The other modules change it by its methods, and hear of changes by `on`. It draws nothing and sends nothing.
 
-const NO_SELECTION = { frame: null, facts: {}, chain: [], parent: null, xyz: null, xyzw: null };
+const NO_SELECTION = { frame: null, facts: {}, chain: [], parent: null, xyz: null, xyzw: null, ellipsoid: null };
 
 export class State {
   #listeners = new Map();
@@ -34,6 +34,7 @@ export class State {
   filter = "";
   onlyChain = false;
   namesMode = "some";
+  ellipsoids = true; // Whether the error of the selected frame is drawn, if it is known.
   follow = null; // {frame, heading}
   measured = null; // The frame that the distance to the selected one is measured from.
   chain = []; // Places, from the selected frame to the fixed one.
