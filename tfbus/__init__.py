@@ -61,6 +61,7 @@ _NAMES_IN = {
     ),
     "events": (
         "AuthorityConflict",
+        "ClockOffset",
         "ClockReset",
         "Event",
         "FrameAdded",
@@ -69,6 +70,7 @@ _NAMES_IN = {
         "FrameStale",
         "KindChanged",
         "PastLoop",
+        "PeerClockStepped",
         "PeerJoined",
         "PeerLost",
         "PeerRejected",
@@ -95,6 +97,7 @@ _NAMES_IN = {
         "BufferStatistics",
         "BusStatistics",
         "LinkStatistics",
+        "PeerClock",
         "QueueStatistics",
         "RecorderStatistics",
         "RobotStatistics",

@@ -34,6 +34,7 @@ from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import SeenKeys
 from tfbus.errors import UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.links.clocks import OwnClock
 from tfbus.links.message import can_hold, sendable
 from tfbus.links.replica import Entry, Known, OutgoingBatch, Provenance, ReceivedTransform, RemovedFrame, Replica, View
 from tfbus.links.seams import Host
@@ -159,10 +160,12 @@ class Relay:
     Attributes
     ----------
     replica : Replica
+    clock : OwnClock
     """
 
     def __init__(self, bus: Bus) -> None:
         self.replica: Replica = Replica()
+        self.clock: OwnClock = OwnClock(bus.clock)
         self._number = 0
         self._bus = bus
         self._registration: Registration | None = None
@@ -315,6 +318,16 @@ class Relay:
             if not self._bus.closed and known is not None and known.shown is not None and owns(known.shown):
                 self.remove(frame, None)
 
+    def begin_anew(self, origin: bytes) -> tuple[str, ...]:
+        """Forget the samples of the moving frames of a bus, on this bus alone; returns the frames, sorted."""
+        found = []
+        for frame in self.frames_of(lambda source: source.origin == origin):
+            known = self.replica.entries.get(frame)
+            if not self._bus.closed and known is not None and known.sample is not None and not known.sample.static:
+                self.remove(frame, None)
+                found.append(frame)
+        return tuple(found)
+
     # Inside
 
     def _on_batch(self, batch: Batch) -> None:
@@ -334,7 +347,7 @@ class Relay:
         entries = self.replica.entries
         for source, group in groupby(batch, source_of):
             if source is None:
-                source = Provenance(self.replica.origin, self.next_number())
+                source = Provenance(self.replica.origin, self.next_number(), clock=self.clock.base())
             samples = tuple(group)
             for sample in samples:
                 child = sample._fields[1]
@@ -350,7 +363,7 @@ class Relay:
                 shown = known.shown
                 if shown is None or shown.sequence < source.sequence or shown.rank < source.rank:
                     known.shown = source
-            outgoing = OutgoingBatch(source.origin, source.sequence, samples)
+            outgoing = OutgoingBatch(source.origin, source.sequence, samples, source.clock, source.shift)
             for outbox in outboxes:
                 outbox.add(outgoing, echo=outbox is source.outbox)
 

@@ -125,11 +125,17 @@ class OutgoingBatch:
     sequence : int
         The batch's number on that bus.
     samples : sequence of TransformStamped
+    clock : int or None
+        The base of the clock that stamped them, against this machine's steady clock, in ns: see `tfbus.links.clocks`.
+    shift : int
+        The ns by which the stamps of its moving samples were corrected.
     """
 
     origin: bytes
     sequence: int
     samples: Sequence[TransformStamped]
+    clock: int | None = None
+    shift: int = 0
 
     @property
     def size(self) -> int:
@@ -141,7 +147,11 @@ class OutgoingBatch:
         if frames is None:
             return self
         samples = tuple(sample for sample in self.samples if sample._fields[1] in frames)
-        return OutgoingBatch(self.origin, self.sequence, samples) if samples else None
+        return OutgoingBatch(self.origin, self.sequence, samples, self.clock, self.shift) if samples else None
+
+    def uncorrected(self) -> Sequence[TransformStamped]:
+        """Its samples with the stamps that their sender gave them."""
+        return [_moved(sample, -self.shift) for sample in self.samples] if self.shift else self.samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,12 +185,18 @@ class Provenance:
         The link that brought it, which does not send it back. None for this bus's own.
     peer : Peer or None
         The other end of that link; None for this bus's own.
+    clock : int or None
+        The base of the clock that stamped its samples, as in `OutgoingBatch`; None if it is not known.
+    shift : int
+        The ns by which the stamps of its moving samples were corrected.
     """
 
     origin: bytes
     sequence: int
     outbox: object | None = None
     peer: object | None = None
+    clock: int | None = None
+    shift: int = 0
 
     @property
     def rank(self) -> Rank:
@@ -197,6 +213,15 @@ class ReceivedTransform(TransformStamped):
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy in another process has not come over this link.
         return TransformStamped, (self.parent, self.child, self.stamp, self.transform, self.authority, self.static)
+
+
+def _moved(sample: TransformStamped, shift: int) -> TransformStamped:
+    parent, child, stamp, row, authority, static = sample._fields
+    if static:
+        return sample
+    moved = TransformStamped.__new__(TransformStamped)
+    moved._fields = parent, child, stamp + shift, row, authority, static
+    return moved
 
 
 class ReceivedBatch(OutgoingBatch):
@@ -256,7 +281,8 @@ class Known:
         """As it goes into a message."""
         if self.sample is None:
             return RemovedFrame(self.source.origin, self.source.sequence, self.frame)
-        return OutgoingBatch(self.source.origin, self.source.sequence, (self.sample,))
+        source = self.source
+        return OutgoingBatch(source.origin, source.sequence, (self.sample,), source.clock, source.shift)
 
 
 class Claim(NamedTuple):
