@@ -159,7 +159,9 @@ def test_a_message_is_read_as_it_was_written(out: Outgoing, entries: list[Any]) 
 
 def test_the_stamps_that_a_link_has_corrected_are_written_as_their_sender_gave_them() -> None:
     shifted = replace(batch(moving("map", "a", 107), static("map", "b", stamp=1)), shift=100)
-    assert [sample.stamp for sample in read(write_message(LIVE, [shifted])).entries[0].samples] == [7, 1]
+    come = read(write_message(LIVE, [shifted])).entries[0]
+    assert isinstance(come, ReceivedBatch)
+    assert [sample.stamp for sample in come.samples] == [7, 1]
 
 
 def test_the_section_of_clocks_is_taken_off_before_a_message_is_read() -> None:
@@ -310,7 +312,10 @@ def test_a_sample_that_no_message_can_hold_is_told_with_the_reason() -> None:
         (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(1, 0, 1_025, 1) + b"a" * 1_025, "head"),
         (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(0, 0, 1, 1), "head"),
         (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(0, 0, 1, 1) + tags(0), "head"),
-        (header(origins=1, authorities=1, entries=1) + ONE + NO_CLOCK + b"\0\0" + entry(0, 0, 1, 1) + tags(0), "truncated"),
+        (
+            header(origins=1, authorities=1, entries=1) + ONE + NO_CLOCK + b"\0\0" + entry(0, 0, 1, 1) + tags(0),
+            "truncated",
+        ),
         (header(entries=MAX_ENTRIES + 1), "oversized"),
         (header() + encode([moving("map", "a", 1)]), "tags"),
         (header() + b"x", "truncated"),

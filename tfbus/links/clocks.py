@@ -21,9 +21,9 @@ exchange that contradicts it shows that a steady clock has stopped, as in a mach
 Placing
 -------
 Each batch carries the base of the clock that stamped it, against the steady clock of the sending machine. The receiver
-adds how far that steady clock is ahead of its own, which gives the base against the own steady clock, and passes that on
-with the batch. So a batch that comes over several buses is placed by the sum along the way, whichever of them correct
-their own copies of it. To correct is to add to each stamp the own base less that base. The measured offset
+adds how far that steady clock is ahead of its own, which gives the base against the own steady clock, and passes that
+on with the batch. So a batch that comes over several buses is placed by the sum along the way, whichever of them
+correct their own copies of it. To correct is to add to each stamp the own base less that base. The measured offset
 enters slowly, by `SLEW` at most, but never leaves its bound.
 
 A batch whose clock has stepped does not continue the frames of its bus: the samples before it would be interpolated
@@ -154,7 +154,7 @@ class ClockFilter:
         self._steady: tuple[int, int] | None = None
 
     def note(self, sent: int, heard: int, answered: int, arrived: int, apart: int = 0) -> None:
-        """Take an exchange: when it was sent, heard, answered, and the answer arrived, each by the steady clock there, in ns.
+        """Take an exchange: when it was sent, heard and answered and the answer arrived, by the steady clocks, in ns.
 
         `apart` is the peer's base less the own one.
         """
@@ -190,9 +190,10 @@ class ClockFilter:
         if self._steady is not None:
             before, at = self._steady
             most = round(SLEW * max(now - at, 0))
-            if abs(ahead - before) <= _STILL:
+            aim = min(max(ahead, before - most), before + most)
+            if abs(aim - before) <= _STILL and abs(ahead - before) <= bound:
                 return before
-            ahead = min(max(min(max(ahead, before - most), before + most), ahead - bound), ahead + bound)
+            ahead = min(max(aim, ahead - bound), ahead + bound)
         self._steady = ahead, now
         return ahead
 
@@ -272,7 +273,7 @@ class _Origin:
     """The clock of a bus as its last live batch has told it, by one link."""
 
     link: str
-    told: int
+    told: int | None
     shift: int
     at: int
     step: int = 0
@@ -343,6 +344,13 @@ class Clocks:
                 apart = 0 if base is None or own is None else base - own
                 peer.note(echo[0], echo[1], steady, arrived, apart)
 
+    def is_measured(self, link: str) -> bool | None:
+        """Whether the clock of a peer can be placed now; None if it never can, because it does not run by itself."""
+        peer = self._peers.get(link)
+        if peer is None or peer.base is None:
+            return None if link in self._bases else False
+        return peer.ahead(self.own.steady()) is not None
+
     def section(self, *, answers: bool) -> bytes:
         """The end of a sign that goes out now; one to a single peer answers no others."""
         self.settle()
@@ -352,20 +360,20 @@ class Clocks:
             echoes.append((bytes.fromhex(link[:16]), steady, arrived))
         return write_section(self.own.steady(), self.own.base(), echoes)
 
-    def place(self, link: str, told: int, *, direct: bool) -> tuple[int | None, int]:
+    def place(self, link: str, told: int | None, *, direct: bool) -> tuple[int | None, int]:
         """The base of the clock of a batch against the own steady clock, and what to add to its stamps, in ns.
 
         Parameters
         ----------
         link : str
             The peer that has sent the batch.
-        told : int
+        told : int or None
             The base that it tells, against its own steady clock.
         direct : bool
             Whether the clock is that of the peer's own bus.
         """
         peer = self._peers.get(link)
-        if peer is None:
+        if peer is None or told is None:
             return None, 0
         if direct:
             self._rebase(link, peer, told)
@@ -375,7 +383,7 @@ class Clocks:
         own = self.own.base() if self.corrects else None
         return told + ahead, 0 if own is None else own - told - ahead
 
-    def jumps(self, link: str, origin: bytes, told: int, shift: int) -> bool:
+    def jumps(self, link: str, origin: bytes, told: int | None, shift: int) -> bool:
         """Take the clock of a live batch of a bus; returns whether its stamps do not go on from those before.
 
         Parameters
@@ -383,7 +391,7 @@ class Clocks:
         link : str
             The peer that has sent it. While several bring the samples of one bus, the first one is followed.
         origin : bytes
-        told : int
+        told : int or None
             The base of the clock, against the steady clock of the peer's machine.
         shift : int
             What was added to its stamps.
@@ -396,7 +404,8 @@ class Clocks:
                     del self._origins[next(iter(self._origins))]
                 self._origins[origin] = _Origin(link, told, shift, now)
             return False
-        step, moved, limit = told - before.told, shift - before.shift, STEP + _SLEW_OF_BASE * (now - before.at)
+        step = 0 if told is None or before.told is None else told - before.told
+        moved, limit = shift - before.shift, STEP + _SLEW_OF_BASE * (now - before.at)
         before.told, before.shift, before.at = told, shift, now
         before.step = step if abs(step) > limit else 0
         return abs(moved) > limit if self.corrects else bool(before.step)

@@ -309,7 +309,8 @@ class DomainEnd(Endpoint):
             if peer.rate:
                 # A peer hears of a filter by the first question.
                 self._agreement.joined(sender, self._view_of(peer.robot), self._now(), must_ask=self._filters)
-                self._history.joined(sender)
+                if not self.clocks.corrects:
+                    self._history.joined(sender)
             self.host.stir()
         elif sender not in self.peers and len(self._waiting) < MOST_WAITING:
             self._waiting[sender] = joined
@@ -355,8 +356,7 @@ class DomainEnd(Endpoint):
             self._update_ways(peer, heard)
             if heard.kind in (Kind.SIGN, Kind.MEETING):
                 self.lookups.note_server(sender, peer.robot, heard.serves)
-                self.clocks.settle()
-                self._tell_offsets()
+                self._settle_clocks(peer)
                 if not peer.rate:
                     return
             if heard.kind is not Kind.SIGN:
@@ -404,7 +404,7 @@ class DomainEnd(Endpoint):
             self.relay.heard(entry.sequence)
             source = Provenance(entry.origin, entry.sequence, self, peer)
             if isinstance(entry, ReceivedBatch):
-                if entry.clock is not None and self._place(peer, source, entry, heard):
+                if self._place(peer, source, entry, heard):
                     # What came before the step is published before what came behind it.
                     self._publish(together, heard.kind)
                     together = []
@@ -430,16 +430,46 @@ class DomainEnd(Endpoint):
 
     def _place(self, peer: Peer, source: Provenance, entry: ReceivedBatch, heard: Heard) -> bool:
         """Note the clock of a batch, and correct its stamps; returns whether they do not go on from those before."""
-        assert entry.clock is not None
-        source.clock, shift = self.clocks.place(peer.id, entry.clock, direct=entry.origin == heard.bus)
+        source.told = entry.clock
         moving = [sample for sample in entry.samples if not sample._fields[5]]
+        self._correct(peer, source, moving, direct=entry.origin == heard.bus)
+        is_live = heard.kind is Kind.LIVE and bool(moving)
+        return is_live and self.clocks.jumps(peer.id, entry.origin, entry.clock, source.shift)
+
+    def _correct(
+        self, peer: Peer, source: Provenance, moving: Sequence[ReceivedTransform], *, direct: bool = False
+    ) -> None:
+        """Find the clock of a source, and if stamps are to be corrected, move those of its samples, which are new."""
+        source.clock, shift = self.clocks.place(peer.id, source.told, direct=direct)
         if shift and all(FIRST_STAMP <= sample._fields[2] + shift < END_OF_STAMPS for sample in moving):
             source.shift = shift
             for sample in moving:
                 parent, child, stamp, row, authority, static = sample._fields
                 sample._fields = parent, child, stamp + shift, row, authority, static
-        is_live = heard.kind is Kind.LIVE and bool(moving)
-        return is_live and self.clocks.jumps(peer.id, entry.origin, entry.clock, source.shift)
+
+    def _settle_clocks(self, peer: Peer) -> None:
+        """Read what signs have told of clocks; once that of a peer is known, correct what it told before."""
+        self.clocks.settle()
+        self._tell_offsets()
+        is_measured = self.clocks.is_measured(peer.id)
+        if peer.is_placed or is_measured is False:
+            return
+        peer.is_placed = True
+        for known in list(self.relay.replica.entries.values()) if is_measured else ():
+            source, sample = known.source, known.sample
+            if source.peer is not peer or source.clock is not None or not isinstance(sample, ReceivedTransform):
+                continue
+            # Others may hold the sample as it came.
+            moved = sample.again()
+            self._correct(peer, source, () if sample.static else (moved,))
+            if source.shift and not sample.static:
+                known.sample = moved
+                if known.shown is not None and not self.bus.closed:
+                    self.relay.remove(known.frame, None)
+        if self.clocks.corrects and peer.rate:
+            self._history.joined(peer.id)
+        if self.clocks.corrects and not self._history.open:
+            self._show()
 
     def _begin_anew(self, peer: Peer, source: Provenance) -> None:
         """Forget the older samples of a bus whose stamps have jumped, because the newer ones do not go on from them."""

@@ -112,6 +112,8 @@ class Peer:
         Whether it has announced that it is there.
     robot : str
         The robot whose link it is; empty without one.
+    is_placed : bool
+        Whether its clock has been measured, or cannot be.
     rate : float
         How often newest samples are wanted of it, in Hz; infinite for everything, 0 for nothing.
     thinned : float
@@ -135,6 +137,7 @@ class Peer:
     id: str
     present: bool = False
     robot: str = ""
+    is_placed: bool = False
     rate: float = inf
     thinned: float = -inf
     number: int = 0

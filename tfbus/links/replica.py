@@ -185,8 +185,10 @@ class Provenance:
         The link that brought it, which does not send it back. None for this bus's own.
     peer : Peer or None
         The other end of that link; None for this bus's own.
+    told : int or None
+        The base of the clock that stamped its samples, as the peer has told it.
     clock : int or None
-        The base of the clock that stamped its samples, as in `OutgoingBatch`; None if it is not known.
+        The same, as in `OutgoingBatch`; None if it is not known.
     shift : int
         The ns by which the stamps of its moving samples were corrected.
     """
@@ -195,6 +197,7 @@ class Provenance:
     sequence: int
     outbox: object | None = None
     peer: object | None = None
+    told: int | None = None
     clock: int | None = None
     shift: int = 0
 
@@ -209,6 +212,12 @@ class ReceivedTransform(TransformStamped):
 
     __slots__ = ("_provenance",)
     _provenance: Provenance
+
+    def again(self) -> "ReceivedTransform":
+        """The same once more, so that its fields may change."""
+        again = ReceivedTransform.__new__(ReceivedTransform)
+        again._fields, again._provenance = self._fields, self._provenance
+        return again
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy in another process has not come over this link.
@@ -456,8 +465,9 @@ class Replica:
     def _replaces(source: Provenance, sample: TransformStamped | None, known: Known) -> bool:
         if source.sequence != known.source.sequence or source.origin != known.source.origin:
             return source.rank > known.source.rank
-        # Two samples of one batch.
-        return sample is not None and known.sample is not None and sample.stamp > known.sample.stamp
+        # Two samples of one batch, by the stamps that its sender gave them.
+        shift = source.shift - known.source.shift
+        return sample is not None and known.sample is not None and sample.stamp - shift > known.sample.stamp
 
     def _admit(self, origin: bytes, known: Known | None, sample: TransformStamped | None, max_frames: float) -> None:
         """Count a new entry in place of a known one."""
