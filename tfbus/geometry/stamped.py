@@ -428,3 +428,23 @@ def not_physical(sample: TransformStamped, bound: float) -> InvalidTransformErro
         child=child,
         authority=authority,
     )
+
+
+def shifted(sample: TransformStamped, nanoseconds: int) -> TransformStamped:
+    """A sample with its stamp moved; a static one is returned itself, because it holds at every stamp.
+
+    Raises
+    ------
+    InvalidTransformError
+        If the stamp does not fit 64 bits then.
+    """
+    parent, child, stamp, row, authority, static = sample._fields
+    if static:
+        return sample
+    stamp += nanoseconds
+    if not STAMP_MIN <= stamp <= STAMP_MAX:
+        why = f"the stamp of frame {child!r} and the offset of its source do not fit 64 bits"
+        raise InvalidTransformError(why, reason="stamp", parent=parent, child=child, authority=authority)
+    moved = TransformStamped.__new__(TransformStamped)
+    moved._fields = parent, child, stamp, row, authority, static
+    return moved

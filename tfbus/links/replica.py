@@ -82,7 +82,7 @@ try:
 except ImportError:  # A Python that has it elsewhere.
     from hashlib import blake2b
 
-from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.stamped import TransformStamped, shifted
 from tfbus.rows import Row
 
 SETTLING = 1.5
@@ -151,7 +151,7 @@ class OutgoingBatch:
 
     def uncorrected(self) -> Sequence[TransformStamped]:
         """Its samples with the stamps that their sender gave them."""
-        return [_moved(sample, -self.shift) for sample in self.samples] if self.shift else self.samples
+        return [shifted(sample, -self.shift) for sample in self.samples] if self.shift else self.samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,15 +222,6 @@ class ReceivedTransform(TransformStamped):
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy in another process has not come over this link.
         return TransformStamped, (self.parent, self.child, self.stamp, self.transform, self.authority, self.static)
-
-
-def _moved(sample: TransformStamped, shift: int) -> TransformStamped:
-    parent, child, stamp, row, authority, static = sample._fields
-    if static:
-        return sample
-    moved = TransformStamped.__new__(TransformStamped)
-    moved._fields = parent, child, stamp + shift, row, authority, static
-    return moved
 
 
 class ReceivedBatch(OutgoingBatch):
