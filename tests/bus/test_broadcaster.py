@@ -68,13 +68,12 @@ def test_an_offset_is_a_number_of_seconds(offset: object, error: type[Exception]
 
 def test_a_stamp_beyond_all_stamps_because_of_the_offset_is_refused() -> None:
     broadcaster = TransformBroadcaster(Bus(), offset=1.0)
-    for send in (
-        lambda: broadcaster.send("map", "odom", HERE, at=STAMP_MAX),
-        lambda: broadcaster.send_all([moving("map", "odom", STAMP_MAX)]),
-        lambda: broadcaster.send_columns("map", "odom", [(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 1.0)], [STAMP_MAX]),
-    ):
-        with pytest.raises(ValueError, match="fit 64"):
-            send()
+    with pytest.raises(InvalidTransformError, match="fit 64"):
+        broadcaster.send("map", "odom", HERE, at=STAMP_MAX)
+    with pytest.raises(InvalidTransformError, match="fit 64"):
+        broadcaster.send_all([moving("map", "odom", STAMP_MAX)])
+    with pytest.raises(ValueError, match="fit 64"):
+        broadcaster.send_columns("map", "odom", [(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 1.0)], [STAMP_MAX])
 
 
 SECOND_ODOMETRY = Odometry("t265", 7, "base", HERE, (0.5, 0.0, 0.0), (0.0, 0.0, 0.1))

@@ -16,6 +16,7 @@ from tfbus import (
     PeerJoined,
     Transform,
     TransformBroadcaster,
+    format_stamp,
 )
 from tfbus.links.clocks import STEP, TOLERANCE, ClockFilter
 
@@ -57,7 +58,7 @@ def test_the_exchange_of_the_lowest_round_trip_is_believed_until_it_is_too_old()
     measured = ClockFilter()
     measured.note(0, 1_000, 1_000, 2_000)
     measured.note(SECOND, SECOND + 50_000_000, SECOND + 50_000_000, SECOND + 50_000_100)
-    assert measured.ahead(SECOND + 50_000_100) == (0, 1_002 + round(TOLERANCE * (SECOND + 50_000_100 - 1_000)))
+    assert measured.ahead(SECOND + 50_000_100) == (0, 1_001 + round(TOLERANCE * (SECOND + 50_000_100 - 1_000)))
     late = 500 * SECOND
     measured.note(late, late + 50_000_000, late + 50_000_000, late + 50_000_100)
     found = measured.ahead(late)
@@ -235,6 +236,25 @@ def test_a_clock_that_is_set_is_noticed_at_once_and_nothing_is_interpolated_acro
         for at in range(oldest, newest, 3_000_000):
             x = buffer.lookup_nowait("map", "cart", at).transform.translation[0]
             assert x == pytest.approx(at / SECOND - ahead, abs=0.001)
+
+
+@pytest.mark.parametrize("corrects", [False, True])
+def test_explanations_and_errors_name_the_clock_that_differs(corrects: bool) -> None:
+    world = World()
+    network = Network(world)
+    network.delay = lambda *_: 0.0004
+    clock = SkewedClock(world, 0.31)
+    here = world.process(network, clock=SkewedClock(world), corrects=corrects)
+    there = world.process(network, clock=clock)
+    with Buffer(here.bus) as buffer:
+        go(world, 5.0, 0.1, (there, "cart", clock))
+        clear = buffer.explain("map", "cart").edges[0].clock
+        missing = buffer.explain("map", "cart", round((world.now + 1.0) * SECOND)).errors
+    stamped = f", and stamped {format_stamp(there.frames['cart'].stamp)}" if corrects else ""
+    assert clear == f"its clock runs 310 ms ahead of this one{stamped}"
+    assert [str(error).endswith(clear) for error in missing] == [True]
+    assert str(buffer.explain("map", "cart")).endswith(clear)
+    assert here.bus.statistics().frames == 1
 
 
 def test_a_small_change_is_no_step() -> None:

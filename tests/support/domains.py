@@ -51,7 +51,7 @@ class SkewedClock(SystemClock):
 
     @property
     def offset(self) -> float:
-        """How far it is ahead of the time of the world, in s."""
+        """The s by which it is ahead of the time of the world."""
         return self.ahead + self.drift * (self._world.now - self._began)
 
 

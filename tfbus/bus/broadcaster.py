@@ -236,7 +236,9 @@ class TransformBroadcaster:
         if at is None or np.ndim(cast(Any, at)) == 0:
             stamps = self._stamp(cast("StampLike | None", at))
         else:
-            stamps = [stamp + self._offset for stamp in as_stamps(at).tolist()] if self._offset else at
+            stamps = (
+                [stamp + self._offset for stamp in as_stamps(cast("StampsLike", at)).tolist()] if self._offset else at
+            )
         self._to.publish_columns(above, below, stamps, translations, rotations, self.authority, invalid=self._invalid)
 
     def send_static(self, parent: str, child: str, transform: Transform) -> None:

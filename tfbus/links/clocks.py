@@ -43,11 +43,11 @@ from tfbus.stamps import SECOND, to_seconds
 from tfbus.statistics import PeerClock
 
 TOLERANCE: Final = 200e-6
-"""How fast two steady clocks may drift apart: each is a crystal of 100 ppm."""
+"""The greatest drift between two steady clocks, in s per s: each is a crystal of 100 ppm."""
 KEPT: Final = 32
 """The exchanges of a peer that are kept."""
 SLEW: Final = 500e-6
-"""How fast the offset by which stamps are corrected approaches the measured one."""
+"""The rate at which the offset of corrected stamps approaches the measured one, in s per s."""
 STEP: Final = 5_000_000
 """ns; a base that changes by more between two messages, and by more than 0.1 % of the time between them, was set."""
 MOST_ECHOES: Final = 64
@@ -114,7 +114,7 @@ class Exchange(NamedTuple):
     at : int
         The middle of it, by the own steady clock.
     ahead : int
-        How far the peer's steady clock was ahead.
+        The lead of the peer's steady clock.
     bound : int
         The greatest error of that.
     delay : int
@@ -177,7 +177,7 @@ class ClockFilter:
         self._set_at = self._exchanges[-1].at if self._exchanges else None
 
     def ahead(self, now: int) -> tuple[int, int] | None:
-        """How far the peer's steady clock is ahead at a time of the own one, and the bound of the error, in ns."""
+        """The lead of the peer's steady clock at a time of the own one, and the bound of the error, in ns."""
         best = self._best(now)
         return None if best is None else (best.ahead, best.bound_at(now))
 
@@ -198,7 +198,7 @@ class ClockFilter:
         return ahead
 
     def statistics(self, peer: str, authorities: tuple[str, ...], own_base: int | None, now: int) -> PeerClock:
-        """What is known at a time of the own steady clock."""
+        """The clock of the peer at a time of the own steady clock."""
         found = self.ahead(now)
         if self.base is None or own_base is None or found is None:
             return PeerClock(peer, authorities, runs=self.base is not None)
@@ -394,7 +394,7 @@ class Clocks:
         told : int or None
             The base of the clock, against the steady clock of the peer's machine.
         shift : int
-            What was added to its stamps.
+            The ns that were added to its stamps.
         """
         now = self.own.steady()
         before = self._origins.get(origin)
@@ -411,7 +411,7 @@ class Clocks:
         return abs(moved) > limit if self.corrects else bool(before.step)
 
     def step_of(self, origin: bytes) -> int:
-        """How far the clock of a bus was set between its last two live batches, in ns."""
+        """The step of the clock of a bus between its last two live batches, in ns."""
         return self._origins[origin].step
 
     def news(self) -> Iterator[tuple[str, PeerClock, bool]]:

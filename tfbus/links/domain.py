@@ -46,7 +46,7 @@ from tfbus.links.replica import (
     View,
 )
 from tfbus.links.seams import Hearing, Joined, Left, Received, Wire, WireItem
-from tfbus.stamps import as_duration, to_seconds
+from tfbus.stamps import SECOND, as_duration, to_seconds
 from tfbus.statistics import PeerClock
 from tfbus.tf_message import MalformedMessageError
 
@@ -148,7 +148,8 @@ class DomainEnd(Endpoint):
         self._channels = Channels(wire, self._bus, self.frames is not None, slow_rate, self.report)
         self.own: View = self._view_of(self._robot)
         self._agreement = Agreement()
-        self.clocks: Clocks = Clocks(self.relay.clock, self.id, as_duration(max_offset, "max_offset"))
+        self.max_offset: float = as_duration(max_offset, "max_offset") * SECOND
+        self.clocks: Clocks = Clocks(self.relay.clock, self.id, max_offset)
         self._history = HistoryAsker(history or 0.0, wire.send, now)
         self.lookups: RemoteLookups = RemoteLookups(wire.send, name)
         # The last sign of each peer that agrees with this link: the same sign once more need not wake the event loop.
@@ -405,7 +406,7 @@ class DomainEnd(Endpoint):
             source = Provenance(entry.origin, entry.sequence, self, peer)
             if isinstance(entry, ReceivedBatch):
                 if self._place(peer, source, entry, heard):
-                    # What came before the step is published before what came behind it.
+                    # The samples before the step are published before those behind it.
                     self._publish(together, heard.kind)
                     together = []
                     self._begin_anew(peer, source)

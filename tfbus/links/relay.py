@@ -40,6 +40,7 @@ from tfbus.links.replica import Entry, Known, OutgoingBatch, Provenance, Receive
 from tfbus.links.seams import Host
 from tfbus.registration import Registration
 from tfbus.rows import Row
+from tfbus.stamps import format_duration, format_stamp
 
 LARGEST_JUMP = 2**52
 """A number may be so far ahead of this machine's time: 142 years in us, for some machines begin in 1970."""
@@ -70,10 +71,13 @@ class Outbox:
         The frames that the links of each robot bring by this link.
     own : View or None
         The view of them that this link tells; None if it tells no entries.
+    max_offset : float
+        Clocks that differ by so many ns at most are near enough.
     """
 
     host: Host
     own: View | None = None
+    max_offset: float = inf
 
     def __init__(self, frames: Iterable[str] | None) -> None:
         self.frames: frozenset[str] | None = None if frames is None else frozenset(frames)
@@ -331,6 +335,19 @@ class Relay:
                 found.append(frame)
         return tuple(found)
 
+    def clock_of(self, frame: str) -> str:
+        """The clock that stamps a frame beside this bus's, in words; empty if they agree, or that is not known."""
+        known = self.replica.entries.get(frame)
+        source = None if known is None else known.shown
+        own = self.clock.base()
+        if known is None or known.sample is None or source is None or source.clock is None or own is None:
+            return ""
+        ahead = source.clock - own
+        if not isinstance(source.outbox, Outbox) or abs(ahead) <= source.outbox.max_offset:
+            return ""
+        clock = f"its clock runs {format_duration(abs(ahead))} {'ahead of' if ahead > 0 else 'behind'} this one"
+        return f"{clock}, and stamped {format_stamp(known.sample.stamp - source.shift)}" if source.shift else clock
+
     # Inside
 
     def _on_batch(self, batch: Batch) -> None:
@@ -408,7 +425,8 @@ class Relay:
 def relay_of(bus: Bus) -> Relay:
     """The relay of a bus, which its links share; the bus itself holds it."""
     if not isinstance(bus._relay, Relay):
-        bus._relay = Relay(bus)
+        relay = bus._relay = Relay(bus)
+        bus._clock_of = relay.clock_of
     return bus._relay
 
 

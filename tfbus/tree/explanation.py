@@ -45,6 +45,8 @@ class ExplainedEdge(PlainData):
         The sender of the newest sample; may be empty.
     error : ExtrapolationError or None
         The reason why this edge blocks the answer.
+    clock : str
+        The clock of the sender beside the clock of the bus, in words, if a link knows that they differ; else empty.
 
     Examples
     --------
@@ -66,6 +68,7 @@ class ExplainedEdge(PlainData):
     rate: float | None = None
     authority: str = ""
     error: ExtrapolationError | None = None
+    clock: str = ""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -163,7 +166,7 @@ def _cells(edge: ExplainedEdge, now: int | None, below: bool) -> list[str]:
         format_rate(edge.static, edge.newest, edge.rate),
         age,
         _samples(edge),
-        f"from {edge.authority!r}" if edge.authority else "",
+        "; ".join(filter(None, (f"from {edge.authority!r}" if edge.authority else "", edge.clock))),
     ]
 
 
