@@ -5,7 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 
 import anyio
@@ -14,9 +14,17 @@ from support.processes import free_address, new_domain
 
 from tfbus import Buffer, Bus, ClockOffset, PeerClockStepped, PeerJoined, TransformLookupError
 from tfbus.bus.event_stream import EventStream
+from tfbus.links import DomainLink
 
 zenoh_rooms = pytest.importorskip("tfbus.links.zenoh", reason='pip install "tfbus[zenoh]"')
 pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """One event loop: links do not depend on it, and these tests take real seconds."""
+    return "asyncio"
+
 
 CHILD = Path(__file__).parents[1] / "support" / "clock_process.py"
 SOON = 5.0
@@ -54,8 +62,8 @@ class Switch:
                 tasks.start_soon(self._pass_on, near, far, self._delays[0])
                 tasks.start_soon(self._pass_on, far, near, self._delays[1])
 
-        listener = await anyio.create_tcp_listener(local_host="127.0.0.1", local_port=int(port))
-        await listener.serve(take)
+        async with await anyio.create_tcp_listener(local_host="127.0.0.1", local_port=int(port)) as listener:
+            await listener.serve(take)
 
     async def _pass_on(self, source: anyio.abc.SocketStream, sink: anyio.abc.SocketStream, delay: float) -> None:
         put, get = anyio.create_memory_object_stream[tuple[float, bytes]](10_000)
@@ -65,10 +73,11 @@ class Switch:
                 await anyio.sleep_until(due)
                 await sink.send(data)
 
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(deliver)
-            async for data in source:
-                await put.send((anyio.current_time() + delay, data))
+        with put, get, suppress(anyio.BrokenResourceError, anyio.ClosedResourceError):
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(deliver)
+                async for data in source:
+                    await put.send((anyio.current_time() + delay, data))
 
 
 @asynccontextmanager
@@ -86,6 +95,16 @@ async def wait_for(events: EventStream, kind: type) -> object:
             if isinstance(event, kind):
                 return event
     raise AssertionError(kind)
+
+
+async def measured(link: DomainLink) -> None:
+    """Wait for an exchange of which half is no millimetre at 1 m/s; the machine may be busy."""
+    for _ in range(120):
+        if any((clock.delay or 1.0) < 0.0008 for clock in link.statistics().clocks):
+            break
+        await anyio.sleep(0.5)
+    # Stamps move slowly to a better offset.
+    await anyio.sleep(3.0)
 
 
 async def wrong_by(buffer: Buffer, frame: str) -> float:
@@ -114,7 +133,7 @@ async def test_a_clock_that_differs_is_told_and_corrected_to_a_millimetre(ahead:
                 told = await wait_for(events, ClockOffset)
                 assert isinstance(told, ClockOffset)
                 assert abs(told.offset - ahead) <= told.bound + 100 * drift
-                await anyio.sleep(3.0)
+                await measured(link)
                 assert await wrong_by(buffer, "cart") < 0.001
                 (clock,) = link.statistics().clocks
                 assert clock.offset is not None
@@ -126,7 +145,7 @@ async def test_a_far_clock_is_corrected_by_the_sum_along_the_way() -> None:
     near, far = new_domain(), new_domain()
     here, there = free_address(), free_address()
     with Bus() as bus, Buffer(bus) as buffer, bus.events(capacity=100_000) as events:
-        async with zenoh_rooms.ZenohLink(bus, near, listen=here, correct_clocks=True):
+        async with zenoh_rooms.ZenohLink(bus, near, listen=here, correct_clocks=True) as link:
             bridge = {"domain": near, "connect": here}, {"domain": far, "listen": there}
             with (
                 process(*bridge, ahead=-0.3, frame="near"),
@@ -134,8 +153,10 @@ async def test_a_far_clock_is_corrected_by_the_sum_along_the_way() -> None:
             ):
                 await wait_for(events, PeerJoined)
                 await anyio.sleep(8.0)
+                await measured(link)
                 assert await wrong_by(buffer, "near") < 0.001
-                assert await wrong_by(buffer, "far") < 0.001
+                # Two measurements, each as good as the first.
+                assert await wrong_by(buffer, "far") < 0.002
 
 
 @pytest.mark.parametrize("ahead", [0.0, 0.3])

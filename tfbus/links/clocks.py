@@ -58,6 +58,7 @@ _STILL: Final = 20_000
 _SLOW_READING: Final = 50_000
 _READINGS: Final = 3
 _SHORTEST_FIT: Final = 4 * SECOND
+_PLACED: Final = SECOND // 2
 _OTHER_ROUTE: Final = 10 * SECOND
 _MOST_ORIGINS: Final = 10_000
 _MOST_ARRIVED: Final = 1_000
@@ -86,21 +87,26 @@ class OwnClock:
         self.steady = steady
         self.runs: bool = not isinstance(clock, SimulatedClock)
         self._clock = clock
+        self._may_be_unset = hasattr(clock, "is_set")
         self._base: int | None = None
 
     def base(self) -> int | None:
         """The clock less the steady clock, in ns; None if it does not run by itself, or has no time yet."""
-        if not self.runs or not getattr(self._clock, "is_set", True):
+        if not self.runs or (self._may_be_unset and not self._clock.is_set):  # type: ignore[attr-defined]
             return None
-        narrowest = base = 0
+        before = self.steady()
+        now = self._now()
+        took = self.steady() - before
         for _ in range(_READINGS):
-            before = self.steady()
-            now = self._now()
-            took = self.steady() - before
-            if not base or took < narrowest:
-                narrowest, base = took, now - before - took // 2
             if took <= _SLOW_READING:
                 break
+            # The thread was interrupted between the readings.
+            again = self.steady()
+            later = self._now()
+            took_again = self.steady() - again
+            if took_again < took:
+                before, now, took = again, later, took_again
+        base = now - before - took // 2
         if self._base is None or abs(base - self._base) > _STILL:
             self._base = base
         return self._base
@@ -147,6 +153,8 @@ class ClockFilter:
 
     def __init__(self) -> None:
         self._exchanges: deque[Exchange] = deque(maxlen=KEPT)
+        # All bounds grow alike, so the smallest one stays the smallest until the next exchange.
+        self._best: Exchange | None = None
         self.base: int | None = None
         self.told: float | None = None
         # The exchanges before it are of a clock that was set since.
@@ -166,11 +174,12 @@ class ClockFilter:
         delay = max(away - held, 0)
         ahead = ((heard - sent) + (answered - arrived)) // 2
         found = Exchange((sent + arrived) // 2, ahead, (delay + 1) // 2 + drift, delay, apart)
-        best = self._best(found.at)
+        best = self._best
         if best is not None and abs(best.ahead - ahead) > best.bound_at(found.at) + found.bound:
             self._exchanges.clear()
             self._steady = None
         self._exchanges.append(found)
+        self._best = min(self._exchanges, key=_grown)
 
     def was_set(self) -> None:
         """Note that the clock of either bus was set; what its base was before says nothing of its drift."""
@@ -178,7 +187,7 @@ class ClockFilter:
 
     def ahead(self, now: int) -> tuple[int, int] | None:
         """The lead of the peer's steady clock at a time of the own one, and the bound of the error, in ns."""
-        best = self._best(now)
+        best = self._best
         return None if best is None else (best.ahead, best.bound_at(now))
 
     def smoothly_ahead(self, now: int) -> int | None:
@@ -199,14 +208,17 @@ class ClockFilter:
 
     def statistics(self, peer: str, authorities: tuple[str, ...], own_base: int | None, now: int) -> PeerClock:
         """The clock of the peer at a time of the own steady clock."""
-        found = self.ahead(now)
-        if self.base is None or own_base is None or found is None:
+        found, best = self.offset(own_base, now), self._best
+        if found is None or best is None:
             return PeerClock(peer, authorities, runs=self.base is not None)
-        ahead, bound = found
-        best = self._best(now)
-        assert best is not None
-        offset = to_seconds(ahead + self.base - own_base)
-        return PeerClock(peer, authorities, offset, to_seconds(bound), self._drift(), to_seconds(best.delay))
+        return PeerClock(peer, authorities, *found, self._drift(), to_seconds(best.delay))
+
+    def offset(self, own_base: int | None, now: int) -> tuple[float, float] | None:
+        """The lead of the peer's clock over one of some base at a time of the own steady clock, and its bound; in s."""
+        found = self.ahead(now)
+        if found is None or self.base is None or own_base is None:
+            return None
+        return to_seconds(found[0] + self.base - own_base), to_seconds(found[1])
 
     def _drift(self) -> float | None:
         """The slope of the offsets, least squares weighted by the bounds; None for too short a time."""
@@ -222,8 +234,10 @@ class ClockFilter:
         moment = sum(w * (t - mean) * o for w, t, o in zip(weights, times, offsets, strict=True))
         return moment / sum(w * (t - mean) ** 2 for w, t in zip(weights, times, strict=True))
 
-    def _best(self, now: int) -> Exchange | None:
-        return min(self._exchanges, key=lambda one: one.bound_at(now), default=None)
+
+def _grown(one: Exchange) -> float:
+    """The bound of an exchange at any time, but for a number that all have in common."""
+    return one.bound - TOLERANCE * one.at
 
 
 class Section(NamedTuple):
@@ -274,8 +288,10 @@ class _Origin:
 
     link: str
     told: int | None
+    clock: int | None
     shift: int
     at: int
+    placed: int
     step: int = 0
 
 
@@ -308,6 +324,8 @@ class Clocks:
         self._echoes: dict[str, tuple[int, int]] = {}
         self._origins: dict[bytes, _Origin] = {}
         self._own_base: int | None = None
+        # The peers that were measured since `news` was called.
+        self._news: set[str] = set()
 
     def arrive(self, link: str, section: bytes) -> bool:
         """Take the end of a sign, in any thread; returns whether it tells no step of the peer's clock."""
@@ -329,6 +347,7 @@ class Clocks:
         """Read all that has arrived."""
         own = self.own.base()
         if own is not None and self._own_base is not None and abs(own - self._own_base) > STEP:
+            self._news.update(self._peers)
             for peer in self._peers.values():
                 peer.was_set()
         self._own_base = own
@@ -343,6 +362,7 @@ class Clocks:
             if echo is not None:
                 apart = 0 if base is None or own is None else base - own
                 peer.note(echo[0], echo[1], steady, arrived, apart)
+                self._news.add(link)
 
     def is_measured(self, link: str) -> bool | None:
         """Whether the clock of a peer can be placed now; None if it never can, because it does not run by itself."""
@@ -383,7 +403,18 @@ class Clocks:
         own = self.own.base() if self.corrects else None
         return told + ahead, 0 if own is None else own - told - ahead
 
-    def jumps(self, link: str, origin: bytes, told: int | None, shift: int) -> bool:
+    def goes_on(self, link: str, origin: bytes, told: int | None) -> int | None:
+        """The base of a clock as of the last live batch, if this one tells the same and no stamp is to be corrected."""
+        known = self._origins.get(origin)
+        if known is None or known.told != told or known.link != link or self.corrects:
+            return None
+        now = self.own.steady()
+        if now - known.placed > _PLACED:
+            return None
+        known.at = now
+        return known.clock
+
+    def jumps(self, link: str, origin: bytes, told: int | None, clock: int | None, shift: int) -> bool:
         """Take the clock of a live batch of a bus; returns whether its stamps do not go on from those before.
 
         Parameters
@@ -391,8 +422,8 @@ class Clocks:
         link : str
             The peer that has sent it. While several bring the samples of one bus, the first one is followed.
         origin : bytes
-        told : int or None
-            The base of the clock, against the steady clock of the peer's machine.
+        told, clock : int or None
+            The base of the clock, against the steady clock of the peer's machine, and against the own one.
         shift : int
             The ns that were added to its stamps.
         """
@@ -402,11 +433,11 @@ class Clocks:
             if before is None or now - before.at > _OTHER_ROUTE:
                 if len(self._origins) >= _MOST_ORIGINS:
                     del self._origins[next(iter(self._origins))]
-                self._origins[origin] = _Origin(link, told, shift, now)
+                self._origins[origin] = _Origin(link, told, clock, shift, now, now)
             return False
         step = 0 if told is None or before.told is None else told - before.told
         moved, limit = shift - before.shift, STEP + _SLEW_OF_BASE * (now - before.at)
-        before.told, before.shift, before.at = told, shift, now
+        before.told, before.clock, before.shift, before.at, before.placed = told, clock, shift, now, now
         before.step = step if abs(step) > limit else 0
         return abs(moved) > limit if self.corrects else bool(before.step)
 
@@ -414,24 +445,26 @@ class Clocks:
         """The step of the clock of a bus between its last two live batches, in ns."""
         return self._origins[origin].step
 
-    def news(self) -> Iterator[tuple[str, PeerClock, bool]]:
-        """The peers whose offsets are to be told now, and whether each is over.
+    def news(self) -> Iterator[tuple[str, float, float, bool]]:
+        """The peers whose offsets are to be told now, each with the offset, its bound, and whether it is over; in s.
 
         An offset is told if it exceeds both its bound and `max_offset`, again when it has changed by as much, and when
         it is over.
         """
-        for link, peer in self._peers.items():
-            found = self._statistics(link, peer, ())
-            if found.offset is None or found.bound is None:
+        while self._news:
+            link = self._news.pop()
+            peer = self._peers.get(link)
+            found = None if peer is None else peer.offset(self.own.base(), self.own.steady())
+            if peer is None or found is None:
                 continue
-            least = max(found.bound, self._max_offset)
-            is_off = abs(found.offset) > least
-            if is_off and (peer.told is None or abs(found.offset - peer.told) > least):
-                peer.told = found.offset
-                yield link, found, False
-            elif peer.told is not None and abs(found.offset) <= self._max_offset:
+            offset, bound = found
+            least = max(bound, self._max_offset)
+            if abs(offset) > least and (peer.told is None or abs(offset - peer.told) > least):
+                peer.told = offset
+                yield link, offset, bound, False
+            elif peer.told is not None and abs(offset) <= self._max_offset:
                 peer.told = None
-                yield link, found, True
+                yield link, offset, bound, True
 
     def statistics(self, peers: Iterable[tuple[str, Iterable[str]]]) -> tuple[PeerClock, ...]:
         """The clocks of some peers, each given by its id and its authorities."""
@@ -448,5 +481,6 @@ class Clocks:
     def _rebase(self, link: str, peer: ClockFilter, base: int | None) -> None:
         if base is not None and abs(base - self._bases.get(link, base)) > STEP:
             peer.was_set()
+            self._news.add(link)
         peer.base = base
         self._bases[link] = _NO_BASE if base is None else base

@@ -432,10 +432,13 @@ class DomainEnd(Endpoint):
     def _place(self, peer: Peer, source: Provenance, entry: ReceivedBatch, heard: Heard) -> bool:
         """Note the clock of a batch, and correct its stamps; returns whether they do not go on from those before."""
         source.told = entry.clock
+        source.clock = self.clocks.goes_on(peer.id, entry.origin, entry.clock)
+        if source.clock is not None:
+            return False
         moving = [sample for sample in entry.samples if not sample._fields[5]]
         self._correct(peer, source, moving, direct=entry.origin == heard.bus)
         is_live = heard.kind is Kind.LIVE and bool(moving)
-        return is_live and self.clocks.jumps(peer.id, entry.origin, entry.clock, source.shift)
+        return is_live and self.clocks.jumps(peer.id, entry.origin, entry.clock, source.clock, source.shift)
 
     def _correct(
         self, peer: Peer, source: Provenance, moving: Sequence[ReceivedTransform], *, direct: bool = False
@@ -481,12 +484,12 @@ class DomainEnd(Endpoint):
 
     def _tell_offsets(self) -> None:
         """Announce the clocks that have begun to differ from this one, or no longer do."""
-        for link, clock, over in self.clocks.news():
+        for link, offset, bound, over in self.clocks.news():
             peer = self.peers.get(link)
-            if peer is None or clock.offset is None or clock.bound is None:
+            if peer is None:
                 continue
             authorities = tuple(sorted(peer.authorities))
-            event = ClockOffset(self.bus.clock.now(), self.name, link, authorities, clock.offset, clock.bound, over)
+            event = ClockOffset(self.bus.clock.now(), self.name, link, authorities, offset, bound, over)
             self.bus._announce(event)
             self._log.warning(("clock", link, over), "%s", event)
 
