@@ -15,7 +15,8 @@ errors.SHOWN_FRAMES tree.cycles._SENDERS analysis.arrivals.MAX_SAMPLES cli.comma
 links.message.MAX_BYTES links.message.MAX_SAMPLES links.message.MAX_HEAD links.message.MAX_ENTRIES
 links.message.MAX_TEXT links.message.LONGEST_WAY links.link._MAX_BYTES links.link.MANY links.endpoint.MAX_PEERS
 links.endpoint.MAX_AUTHORITIES links.endpoint.MOST_AUTHORITY_TEXT links.domain.MOST_WAITING links.relay.MOST_ORIGINS
-links.replica.MANY_ORIGINS links.replica.MOST_REMOVALS links.replica.MOST_REMEMBERED links.replica.CHUNK
+links.replica.MANY_ORIGINS links.replica.MOST_REMOVALS links.clocks.MOST_ECHOES links.clocks.KEPT
+links.clocks._MOST_ORIGINS links.replica.MOST_REMEMBERED links.replica.CHUNK
 links.replica.PATIENCE links.domain.MOST_QUESTIONS links.domain.SOONEST_SIGN links.domain.MOST_ROBOTS
 links.channels.MOST_FILTERS links.channels.LONGEST_FILTER links.history.LONGEST_HISTORY links.history.MOST_OF_FRAME
 links.history.MOST_HELD links.history.MOST_HELD_SAMPLES links.history.PATIENCE links.local.local_wire.MOST_CONNECTIONS
@@ -29,7 +30,7 @@ links.rosbridge.rosbridge_link.MOST_QUEUED links.rosbridge.rosbridge_link.SILENC
 links.rosbridge.rosbridge_link.MOST_SAID links.rosbridge.protocol.MAX_VALUE links.rosbridge.protocol.MAX_TEXT
 links.rosbridge.protocol.MOST_TRANSFORMS links.rosbridge.protocol.QUEUE links.dds.dds_link._DEPTH
 links.dds.dds_link._KEPT links.dds.readers.MOST_WAITING links.dds.readers.MOST_BYTES links.ros.settings._LAST_DOMAIN
-_aio.web_door.MAX_HEAD _aio.web_door.HEAD_TIME links.foxglove.MAX_CONNECTIONS view.server.MAX_CONNECTIONS
+_aio.web_door.MAX_HEAD _aio.web_door.HEAD_TIME _aio.web_server.MAX_CONNECTIONS view.server.MAX_CONNECTIONS
 view.server.CAPACITY view.page.EVENTS_KEPT view.page._MATCHES view.page.SAMPLES view.server._PORTS_TRIED
 view.server.MAX_MESSAGE view.server.MAX_TEXT view.meshes.MAX_BYTES view.meshes.MAX_NUMBERS view.meshes.MAX_VERTICES
 view.meshes.MAX_SHAPES plot.plots.SAMPLES plot.plots.LONGEST_NAME

@@ -10,15 +10,19 @@ from support.domains import SECOND, Network, Process, SkewedClock, World
 
 from tfbus import (
     Buffer,
+    Bus,
     ClockOffset,
+    LocalLink,
     PeerClock,
     PeerClockStepped,
     PeerJoined,
+    SimulatedClock,
+    SystemClock,
     Transform,
     TransformBroadcaster,
     format_stamp,
 )
-from tfbus.links.clocks import STEP, TOLERANCE, ClockFilter
+from tfbus.links.clocks import STEP, TOLERANCE, ClockFilter, Clocks, OwnClock, split_section, write_section
 
 # The filter
 
@@ -80,6 +84,45 @@ def test_times_that_no_clocks_can_make_are_left_out() -> None:
     for times in ((0, 0, SECOND, 10), (0, 5, 0, 10), (10, 5, 6, 0)):
         measured.note(*times)
     assert measured.ahead(0) is None
+
+
+@given(
+    st.binary(max_size=100)
+    | st.builds(
+        write_section,
+        st.integers(-(2**63), 2**63 - 1),
+        *[
+            st.integers(-(2**63), 2**63 - 1),
+            st.lists(st.tuples(st.just(bytes(8)), *[st.integers(-(2**63), 2**63 - 1)] * 2), max_size=2),
+        ],
+    ),
+    st.integers(-(2**63) + 1, 2**63 - 1),
+)
+def test_no_section_of_a_stranger_does_harm(data: bytes, told: int) -> None:
+    clocks = Clocks(OwnClock(SystemClock()), "0" * 32, 0.02)
+    clocks.corrects = True
+    clocks.joined("a" * 32)
+    clocks.joined("no hexadecimal digits")
+    for _ in range(3):
+        section = split_section(data)[1]
+        if section:
+            for peer in ("a" * 32, "b" * 32, "no hexadecimal digits"):
+                clocks.arrive(peer, section)
+        assert len(clocks.section(answers=True)) < 100
+        list(clocks.news())
+        assert len(clocks.statistics([("a" * 32, ())])) == 1
+        clock, shift = clocks.place("a" * 32, told, direct=True)
+        assert clock is None or -(2**63) < clock < 2**63
+        assert abs(shift) < 2**65
+        clocks.jumps("a" * 32, b"origin", told, clock, shift)
+    clocks.left("a" * 32)
+
+
+def test_only_a_bus_whose_clock_runs_corrects_others_and_an_offset_is_a_duration() -> None:
+    with pytest.raises(TypeError, match="the bus needs a clock that runs"):
+        LocalLink(Bus(SimulatedClock()), correct_clocks=True)
+    with pytest.raises(ValueError, match="max_offset must not be negative"):
+        LocalLink(Bus(), max_offset=-1.0)
 
 
 # Two processes and more, in simulated time

@@ -34,6 +34,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, NamedTuple, cast
@@ -335,8 +336,10 @@ class Clocks:
         return abs(base - self._bases.get(link, base)) <= STEP
 
     def joined(self, link: str) -> None:
-        """Begin to measure a peer."""
-        self._peers[link] = ClockFilter()
+        """Begin to measure a peer; one whose id is not made of hexadecimal digits cannot be answered."""
+        with suppress(ValueError):
+            bytes.fromhex(link[:16])
+            self._peers[link] = ClockFilter()
 
     def left(self, link: str) -> None:
         """Forget a peer."""

@@ -440,6 +440,7 @@ class DomainOptions(EndOptions, total=False):
     capacity: int
     clock: SimulatedClock | HearsTime | None
     tell_clock: bool
+    correct_clocks: bool
 
 
 class DomainLink(Link):
@@ -484,7 +485,8 @@ class DomainLink(Link):
     max_offset : float
         A peer's clock may be so many s ahead of the bus's clock or behind it; beyond that, `ClockOffset` tells of it.
     correct_clocks : bool
-        Whether the stamps of other buses are moved to the clock of this one as they arrive, by the measured offset.
+        Whether the stamps of other buses are moved to the clock of this one as they arrive, by the measured offset; the
+        guide's page on clocks tells when that helps.
 
     Attributes
     ----------

@@ -30,12 +30,9 @@ class ZenohLink(DomainLink):
     lease : float, optional
         Seconds of silence after which a router takes this link for lost; 4 s by default. A process that dies is lost at
         once.
-    correct_clocks : bool
-        Whether the stamps of other buses are moved to the clock of this one as they arrive, by the measured offset; the
-        guide's page on clocks tells when that helps.
     **options
         The options of `tfbus.links.DomainLink`: `robot`, `robots`, `slow_rate`, `frames`, `drop_lost`, `max_frames`,
-        `capacity`, `history`, `max_offset`, `clock` and `tell_clock`.
+        `capacity`, `history`, `max_offset`, `correct_clocks`, `clock` and `tell_clock`.
 
     Raises
     ------
@@ -59,9 +56,8 @@ class ZenohLink(DomainLink):
         listen: Addresses | None = None,
         config: Settings | None = None,
         lease: float | None = None,
-        correct_clocks: bool = False,
         **options: Unpack[DomainOptions],
     ) -> None:
         robot = options.get("robot") or ""
         wire = ZenohWire(check_domain(domain), robot, connect=connect, listen=listen, config=config, lease=lease)
-        super().__init__(bus, domain, wire, correct_clocks=correct_clocks, **options)
+        super().__init__(bus, domain, wire, **options)
