@@ -201,8 +201,8 @@ class ClockFilter:
             before, at = self._steady
             most = round(SLEW * max(now - at, 0))
             aim = min(max(ahead, before - most), before + most)
-            if abs(aim - before) <= _STILL and abs(ahead - before) <= bound:
-                return before
+            if abs(ahead - before) <= _STILL:
+                aim = before
             ahead = min(max(aim, ahead - bound), ahead + bound)
         self._steady = ahead, now
         return ahead
