@@ -9,6 +9,7 @@ import pytest
 from tfbus import (
     SECOND,
     AuthorityConflict,
+    ClockOffset,
     ClockReset,
     Event,
     FrameAdded,
@@ -18,6 +19,7 @@ from tfbus import (
     InvalidTransformError,
     KindChanged,
     PastLoop,
+    PeerClockStepped,
     PeerJoined,
     PeerLost,
     PeerRejected,
@@ -91,6 +93,18 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
     (
         PeerRejected(AT, "tf", "5eed", "truncated", ValueError("ends\nearly")),
         "peer 5eed on tf sent data that were refused: ends\\nearly",
+    ),
+    (
+        ClockOffset(AT, "tf", "5eed", ("arm", "slam"), 0.31, 0.0002),
+        "'arm', 'slam' runs 310 ms ahead of this clock, within 200 us: peer 5eed on tf",
+    ),
+    (
+        ClockOffset(AT, "tf", "5eed", (), -0.01, 0.0002, over=True),
+        "peer 5eed runs 10 ms behind this clock, within 200 us: peer 5eed on tf, which is near enough",
+    ),
+    (
+        PeerClockStepped(AT, "tf", "5eed", -1.0, ("odom", "tool")),
+        "a clock behind peer 5eed on tf was set back by 1 s: its frames begin anew, 'odom', 'tool'",
     ),
     (RecordingDropped(AT, "run.mcap", 7), "the recording run.mcap is behind and loses samples, 7 so far"),
     (RecordingFailed(AT, "run.mcap", OSError("disk\nfull")), "the recording run.mcap has ended early: disk\\nfull"),

@@ -62,6 +62,7 @@ _NAMES_IN = {
     ),
     "events": (
         "AuthorityConflict",
+        "ClockOffset",
         "ClockReset",
         "Event",
         "FrameAdded",
@@ -70,6 +71,7 @@ _NAMES_IN = {
         "FrameStale",
         "KindChanged",
         "PastLoop",
+        "PeerClockStepped",
         "PeerJoined",
         "PeerLost",
         "PeerRejected",
@@ -98,6 +100,7 @@ _NAMES_IN = {
         "BufferStatistics",
         "BusStatistics",
         "LinkStatistics",
+        "PeerClock",
         "QueueStatistics",
         "RecorderStatistics",
         "RobotStatistics",

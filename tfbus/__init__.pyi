@@ -67,6 +67,7 @@ from tfbus.errors import TransformError as TransformError
 from tfbus.errors import TransformLookupError as TransformLookupError
 from tfbus.errors import UnknownFrameError as UnknownFrameError
 from tfbus.events import AuthorityConflict as AuthorityConflict
+from tfbus.events import ClockOffset as ClockOffset
 from tfbus.events import ClockReset as ClockReset
 from tfbus.events import Event as Event
 from tfbus.events import FrameAdded as FrameAdded
@@ -75,6 +76,7 @@ from tfbus.events import FrameRemoved as FrameRemoved
 from tfbus.events import FrameStale as FrameStale
 from tfbus.events import KindChanged as KindChanged
 from tfbus.events import PastLoop as PastLoop
+from tfbus.events import PeerClockStepped as PeerClockStepped
 from tfbus.events import PeerJoined as PeerJoined
 from tfbus.events import PeerLost as PeerLost
 from tfbus.events import PeerRejected as PeerRejected
@@ -110,6 +112,7 @@ from tfbus.statistics import BufferServerStatistics as BufferServerStatistics
 from tfbus.statistics import BufferStatistics as BufferStatistics
 from tfbus.statistics import BusStatistics as BusStatistics
 from tfbus.statistics import LinkStatistics as LinkStatistics
+from tfbus.statistics import PeerClock as PeerClock
 from tfbus.statistics import QueueStatistics as QueueStatistics
 from tfbus.statistics import RecorderStatistics as RecorderStatistics
 from tfbus.statistics import RobotStatistics as RobotStatistics

@@ -289,6 +289,8 @@ class ExtrapolationError(TransformLookupError):
         correct samples are older, and may have expired. Otherwise 0, as in all errors of a tree without a bus.
     max_age : int or None
         The `max_age` that the newest answer of a buffer exceeds, in ns; None if another reason decides.
+    clock : str
+        The clock of the sender beside the clock of the bus, in words, if a link knows that they differ; else empty.
     """
 
     child: str
@@ -299,6 +301,7 @@ class ExtrapolationError(TransformLookupError):
     slack: int
     ahead: int = 0
     max_age: int | None = None
+    clock: str = ""
 
     def __init__(
         self,
@@ -330,6 +333,8 @@ class ExtrapolationError(TransformLookupError):
         if self.ahead:
             ahead = format_duration(self.ahead)
             sender += f"; its newest stamp is {ahead} ahead of the clock, and right samples expire"
+        if self.clock:
+            sender += f"; {self.clock}"
         if self.max_age is not None and self.newest is not None and not isinstance(self.stamp, Latest):
             return f"frame {self.child!r}: {self._age(self.newest, self.stamp, self.max_age)}{sender}"
         cause = self._cause()

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 
 from tfbus.errors import TransformError, loop_text
 from tfbus.plain import PlainData, printable
-from tfbus.stamps import format_duration, format_stamp, likely_cause
+from tfbus.stamps import format_duration, format_stamp, from_seconds, likely_cause
+from tfbus.statistics import PeerClock
 
 
 @dataclass(frozen=True, slots=True)
@@ -531,6 +532,84 @@ class PeerRejected(PlainData):
 
 
 @dataclass(frozen=True, slots=True)
+class ClockOffset(PlainData):
+    """The clock of a peer differs from the clock of this bus.
+
+    It is told when the offset exceeds both its bound and the `max_offset` of the link, again when it has changed by as
+    much, and when it is over.
+
+    Attributes
+    ----------
+    stamp : int
+        Time of the event, in ns.
+    link, peer : str
+        As in `PeerJoined`.
+    authorities : tuple of str
+        The authorities whose samples the peer has sent, sorted.
+    offset : float
+        How far the peer's clock is ahead of this one, in s; negative if it is behind.
+    bound : float
+        The greatest error of the offset, in s.
+    over : bool
+        Whether the offset is no longer above `max_offset`.
+
+    Examples
+    --------
+    >>> print(ClockOffset(0, "tf", "7d4f", ("odometry",), 0.31, 0.0002))
+    0.000 s: 'odometry' runs 310 ms ahead of this clock, within 200 us: peer 7d4f on tf
+    """
+
+    stamp: int
+    link: str
+    peer: str
+    authorities: tuple[str, ...]
+    offset: float
+    bound: float
+    over: bool = False
+
+    def __str__(self) -> str:
+        clock = PeerClock(self.peer, self.authorities, self.offset, self.bound)
+        end = ", which is near enough" if self.over else ""
+        return _line(self.stamp, f"{clock}: peer {self.peer} on {self.link}{end}")
+
+
+@dataclass(frozen=True, slots=True)
+class PeerClockStepped(PlainData):
+    """The clock of another bus was set, and its moving frames begin anew: their older samples are forgotten.
+
+    Otherwise lookups would interpolate between samples before and behind the step.
+
+    Attributes
+    ----------
+    stamp : int
+        Time of the event on this bus's clock, in ns.
+    link, peer : str
+        As in `PeerJoined`: the peer that has brought the samples.
+    step : float
+        How far the clock has moved, in s; negative if it was set back.
+    frames : tuple of str
+        The frames that begin anew, sorted.
+
+    Examples
+    --------
+    >>> print(PeerClockStepped(0, "tf", "7d4f", -1.0, ("base_link",)))
+    0.000 s: a clock behind peer 7d4f on tf was set back by 1 s: its frames begin anew, 'base_link'
+    """
+
+    stamp: int
+    link: str
+    peer: str
+    step: float
+    frames: tuple[str, ...]
+
+    def __str__(self) -> str:
+        way, distance = "back" if self.step < 0 else "forward", format_duration(from_seconds(abs(self.step)))
+        names = ", ".join(map(repr, self.frames))
+        step = f"was set {way} by {distance}: its frames begin anew, {names}"
+        return _line(self.stamp, f"a clock behind peer {self.peer} on {self.link} {step}")
+
+
+@dataclass(frozen=True, slots=True)
 class RecordingDropped(PlainData):
     """A recorder begins to lose samples because the disk is too slow.
 
@@ -603,6 +682,8 @@ Event = (
     | PeerJoined
     | PeerLost
     | PeerRejected
+    | ClockOffset
+    | PeerClockStepped
     | RecordingDropped
     | RecordingFailed
 )

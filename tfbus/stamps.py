@@ -292,6 +292,26 @@ def as_duration(seconds: float, name: str) -> float:
         raise ValueError(f"{name} must be a number of seconds that a float can hold") from None
 
 
+_LARGEST_OFFSET = 1e9
+
+
+def as_offset(seconds: float) -> int:
+    """Nanoseconds that are added to the stamps of a source.
+
+    Raises
+    ------
+    TypeError
+        If it is not a real number.
+    ValueError
+        If it is not finite, or beyond a thousand million s.
+    """
+    if not is_real(seconds):
+        raise TypeError(f"offset must be a number of seconds, not {seconds!r}")
+    if not abs(seconds) <= _LARGEST_OFFSET:
+        raise ValueError(f"offset must be {_LARGEST_OFFSET:g} s at most, ahead or behind, got {seconds!r}")
+    return from_seconds(seconds)
+
+
 def is_real(value: object) -> bool:
     """Whether `value` is a real number of any type, also of numpy; ``bool`` and ``timedelta64`` do not count."""
     kind = type(value)

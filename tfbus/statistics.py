@@ -5,7 +5,10 @@ from dataclasses import dataclass, fields
 from html import escape
 from typing import Any
 
-from tfbus.plain import PlainData
+from tfbus.plain import PlainData, printable
+from tfbus.stamps import format_duration, from_seconds
+
+_SHOWN = 3
 
 
 class Counts(PlainData):
@@ -157,6 +160,54 @@ class BusStatistics(Counts):
     behind: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class PeerClock(PlainData):
+    """The clock of a peer's bus, beside the clock of this bus.
+
+    Attributes
+    ----------
+    peer : str
+        The id of the peer.
+    authorities : tuple of str
+        The authorities whose samples the peer has sent, sorted.
+    offset : float or None
+        How far the peer's clock is ahead of this one, in s; negative if it is behind, None if it is not known.
+    bound : float or None
+        The greatest error of the offset, in s: half the round trip, and the possible drift since it was measured.
+    drift : float or None
+        The change of the offset, in s per s; None for fewer than some seconds of measurements.
+    delay : float or None
+        The round trip of the believed exchange, in s.
+    runs : bool
+        Whether the peer's bus has a clock that runs by itself, rather than a simulated one.
+
+    Examples
+    --------
+    >>> from tfbus.statistics import PeerClock
+    >>> print(PeerClock("7d4f", ("odometry",), 0.31, 0.0002, 1.5e-6, 0.0003))
+    'odometry' runs 310 ms ahead of this clock, within 200 us
+    """
+
+    peer: str
+    authorities: tuple[str, ...] = ()
+    offset: float | None = None
+    bound: float | None = None
+    drift: float | None = None
+    delay: float | None = None
+    runs: bool = True
+
+    def __str__(self) -> str:
+        names = ", ".join(map(repr, self.authorities[:_SHOWN])) + (", ..." if len(self.authorities) > _SHOWN else "")
+        who = names or f"peer {self.peer[:8]}"
+        if not self.runs:
+            return printable(f"{who} has a simulated clock")
+        if self.offset is None or self.bound is None:
+            return printable(f"the clock of {who} is not measured")
+        distance, bound = (format_duration(from_seconds(abs(seconds))) for seconds in (self.offset, self.bound))
+        side = "behind" if self.offset < 0 else "ahead of"
+        return printable(f"{who} runs {distance} {side} this clock, within {bound}")
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class LinkStatistics(Counts):
     """One link since it was entered.
@@ -181,6 +232,8 @@ class LinkStatistics(Counts):
         Rejected messages and samples of peers, by reason.
     queue : QueueStatistics
         The received messages that wait for the event loop.
+    clocks : tuple of PeerClock
+        The clock of each peer, in the order of the ids; empty for links to other worlds, whose programs tell no times.
 
     Examples
     --------
@@ -199,6 +252,7 @@ class LinkStatistics(Counts):
     not_sent: Mapping[str, int]
     rejected: Mapping[str, int]
     queue: QueueStatistics
+    clocks: tuple[PeerClock, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, repr=False)

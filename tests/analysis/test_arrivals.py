@@ -21,7 +21,7 @@ def test_each_frame_and_sender_is_measured_over_the_window() -> None:
     assert base.samples == 101
     assert base.rate == pytest.approx(100.0)
     assert base.delay_mean == pytest.approx((101 * 5 + 9 * 20) / 101e3)
-    assert (base.delay_p99, base.delay_max) == (0.025, 0.025)
+    assert (base.delay_p99, base.delay_max, base.delay_min) == (0.025, 0.025, 0.005)
     assert base.longest_gap == pytest.approx(0.03)
     # 82 periods of 10 ms, and 9 each of 30 ms and of -10 ms.
     assert base.jitter == pytest.approx(0.02 * 0.18**0.5, rel=1e-9)

@@ -39,6 +39,29 @@ def facts(finding: Finding) -> tuple[int, int | None, float | None, int | None]:
     return finding.count, finding.first, None if finding.worst is None else round(finding.worst, 6), finding.at
 
 
+@pytest.mark.parametrize(
+    ("ahead", "drift", "detail"),
+    [
+        (0.3, 0.0, "the clock of 'odometry' is 0.3 s ahead, or more"),
+        (-7.0, 50e-6, "the clock of 'odometry' is 6.99 s behind, or less, and gains 50 us a second"),
+        (-7.0, -50e-6, "the clock of 'odometry' is 7 s behind, or less, and loses 50 us a second"),
+        (-1.4e9, 0.0, "'odometry' stamps by another clock (simulated?)"),
+        (-0.1, 5e-6, None),
+        (-0.1, 0.0, None),
+    ],
+)
+def test_the_clock_of_a_sender_is_fitted_by_arrivals_behind_stamps(
+    ahead: float, drift: float, detail: str | None
+) -> None:
+    examiner, draw = Examiner(), random.Random(3)
+    for k in range(2_000):
+        received = k * SECOND // 10
+        stamp = round(received * (1 + drift) + ahead * SECOND - draw.expovariate(1 / 0.003) * SECOND)
+        examiner.add([moving("odom", "base", stamp, k / 10, "odometry")], received)
+    found = [finding.detail for finding in examiner.findings() if finding.kind == "clock"]
+    assert found == ([] if detail is None else [detail])
+
+
 def placed(samples: list[TransformStamped], places: dict[int, float]) -> list[TransformStamped]:
     """The samples, some of which are at another x."""
     found = list(samples)
@@ -70,7 +93,11 @@ BOXES += [moving("b", "box", k * 100 * MS, 500.0) for k in range(30, 60)]
             {},
             {("stamps go back", "base"): (2, 4 * 100 * MS, 0.2, 300 * MS)},
         ),
-        (TEN, {"delay": -80 * MS}, {("ahead", "base"): (10, 0, 0.08, 0)}),
+        (
+            TEN,
+            {"delay": -80 * MS},
+            {("ahead", "base"): (10, 0, 0.08, 0), ("clock", None): (10, None, 0.08, None)},
+        ),
         (TEN, {"delay": -50 * MS}, {}),
         (
             [*TEN, TEN[4], TEN[4], TEN[7]],

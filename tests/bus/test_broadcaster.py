@@ -11,12 +11,14 @@ from support.samples import moving
 from tfbus import (
     Buffer,
     Bus,
+    Covariance,
     InvalidTransformError,
     LookupTimeoutError,
     SimulatedClock,
     Transform,
     TransformBroadcaster,
     TransformStamped,
+    UncertainSample,
 )
 from tfbus.data import Odometry, PointStamped, PoseStamped, PoseWithCovarianceStamped, to_message
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
@@ -40,6 +42,42 @@ def test_a_sample_has_the_stamp_of_the_clock_and_the_authority() -> None:
     assert {(sample.parent, sample.child, sample.transform, sample.authority) for sample in got} == {
         ("odom", "base", HERE, "odometry")
     }
+
+
+async def test_an_offset_moves_each_stamp_of_a_moving_sample() -> None:
+    bus = Bus(SimulatedClock(start=42))
+    got: list[TransformStamped] = []
+    bus.subscribe(got.extend)
+    broadcaster = TransformBroadcaster(bus, offset=-1e-8)
+    broadcaster.send("map", "odom", HERE)
+    broadcaster.send("map", "odom", HERE, at=50)
+    broadcaster.send_all([("map", "odom", HERE), moving("map", "other", 70)], at=60)
+    for stamps in (80, [81, 91]):
+        broadcaster.send_columns("map", "odom", [(0.0, 0.0, 0.0)] * 2, [(0.0, 0.0, 0.0, 1.0)] * 2, stamps)
+    broadcaster.send_static("map", "lamp", HERE)
+    with Buffer(bus) as buffer:
+        broadcaster.send_all([UncertainSample("map", "dock", 80, HERE, covariance=Covariance.of(xyz=0.5))])
+        assert buffer.lookup_nowait("map", "dock", covariance=True).covariance.matrix[0, 0] == 0.25
+        TransformBroadcaster(bus).send("odom", "base", HERE, at=90)
+        estimate = {"base": "base", "pose": HERE, "at": 100, "buffer": buffer}
+        await broadcaster.correct("map", "odom", **estimate, timeout=1.0)  # type: ignore[arg-type]
+    assert [sample.stamp for sample in got if sample.child != "base"] == [32, 40, 50, 60, 70, 70, 71, 81, 42, 70, 90]
+
+
+@pytest.mark.parametrize(("offset", "error"), [("1", TypeError), (math.nan, ValueError), (1e10, ValueError)])
+def test_an_offset_is_a_number_of_seconds(offset: object, error: type[Exception]) -> None:
+    with pytest.raises(error, match="offset must be"):
+        TransformBroadcaster(Bus(), offset=offset)  # type: ignore[arg-type]
+
+
+def test_a_stamp_beyond_all_stamps_because_of_the_offset_is_refused() -> None:
+    broadcaster = TransformBroadcaster(Bus(), offset=1.0)
+    with pytest.raises(InvalidTransformError, match="fit 64"):
+        broadcaster.send("map", "odom", HERE, at=STAMP_MAX)
+    with pytest.raises(InvalidTransformError, match="fit 64"):
+        broadcaster.send_all([moving("map", "odom", STAMP_MAX)])
+    with pytest.raises(ValueError, match="fit 64"):
+        broadcaster.send_columns("map", "odom", [(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 1.0)], [STAMP_MAX])
 
 
 SECOND_ODOMETRY = Odometry("t265", 7, "base", HERE, (0.5, 0.0, 0.0), (0.0, 0.0, 0.1))

@@ -345,7 +345,7 @@ def test_the_topics_and_the_prefix_of_a_robot_in_a_namespace_are_given_to_every_
 
     assert options.run(hear) == {"robot1/map", "robot1/base", "robot1/laser"}
     for wrong in (LinkOptions(tf=("/a/tf",)), LinkOptions(tf_prefix="a/")):
-        with pytest.raises(UsageError, match="--tf and --tf-prefix are for ROS"):
+        with pytest.raises(UsageError, match="--tf, --tf-prefix and --ros-offset are for ROS"):
             join(wrong)
     with pytest.raises(UsageError, match="cannot be the name of a topic"):
         join(replace(options, tf=("/a b/tf",)))

@@ -75,7 +75,7 @@ NEEDS = {"plot": "matplotlib", "view": "trimesh", "foxglove": "foxglove", "robot
         ("check --from 1", "--from and --to are for recordings, and none is given"),
         ("check yard --ros dds", "--ros joins ROS in place of a domain: leave 'yard' out"),
         ("tree run.mcap --watch", "--watch and --duration are for a domain"),
-        ("tree --tf /robot1/tf", "--tf and --tf-prefix are for ROS: give --ros, such as --ros dds"),
+        ("tree --tf /robot1/tf", "--tf, --tf-prefix and --ros-offset are for ROS: give --ros, such as --ros dds"),
         ("play run.mcap --from=-1", "expected a time from the beginning on"),
         ("play run.mcap --from 10.1", "is 10.000 s long"),
         ("play run.mcap --from 5 --to 4.9", "--to must not be before --from"),

@@ -141,6 +141,15 @@ def test_the_demo_of_a_fleet_shows_what_each_view_brings() -> None:
 
 
 @pytest.mark.thorough
+def test_the_demo_of_clocks_is_as_far_off_as_its_clock_unless_it_corrects() -> None:
+    pytest.importorskip("zenoh")
+    assert output_of("clocks.py") == [
+        "as it is: the clock of 'odometry' is 0.30 s ahead, the answer is 0.30 m off",
+        "corrected: the clock of 'odometry' is 0.30 s ahead, the answer is 0.00 m off",
+    ]
+
+
+@pytest.mark.thorough
 def test_the_demo_of_a_watch_redraws_no_more_than_can_be_seen() -> None:
     *redrawn, summary = output_of("watch.py")
     numbers = [re.findall(r"\d+\.\d+", line) for line in redrawn]

@@ -15,7 +15,8 @@ errors.SHOWN_FRAMES tree.cycles._SENDERS analysis.arrivals.MAX_SAMPLES cli.comma
 links.message.MAX_BYTES links.message.MAX_SAMPLES links.message.MAX_HEAD links.message.MAX_ENTRIES
 links.message.MAX_TEXT links.message.LONGEST_WAY links.link._MAX_BYTES links.link.MANY links.endpoint.MAX_PEERS
 links.endpoint.MAX_AUTHORITIES links.endpoint.MOST_AUTHORITY_TEXT links.domain.MOST_WAITING links.relay.MOST_ORIGINS
-links.replica.MANY_ORIGINS links.replica.MOST_REMOVALS links.replica.MOST_REMEMBERED links.replica.CHUNK
+links.replica.MANY_ORIGINS links.replica.MOST_REMOVALS links.clocks.MOST_ECHOES links.clocks.KEPT
+links.clocks._MOST_ORIGINS links.replica.MOST_REMEMBERED links.replica.CHUNK
 links.replica.PATIENCE links.domain.MOST_QUESTIONS links.domain.SOONEST_SIGN links.domain.MOST_ROBOTS
 links.channels.MOST_FILTERS links.channels.LONGEST_FILTER links.history.LONGEST_HISTORY links.history.MOST_OF_FRAME
 links.history.MOST_HELD links.history.MOST_HELD_SAMPLES links.history.PATIENCE links.local.local_wire.MOST_CONNECTIONS

@@ -14,6 +14,7 @@ from support.processes import peak_of
 from support.samples import moving, static
 
 from tfbus import SECOND, TransformStamped
+from tfbus.links.clocks import read_section, write_section
 from tfbus.links.message import (
     LONGEST_WAY,
     MAX_BYTES,
@@ -32,6 +33,7 @@ from tfbus.links.message import (
     read_fields,
     read_message,
     reason_not_to_send,
+    split_clocks,
     write_body,
     write_message,
     write_text,
@@ -42,6 +44,7 @@ from tfbus.tf_message import MalformedMessageError, encode
 ONE, OTHER, BUS = b"0123456789abcdef", b"fedcba9876543210", b"a bus of a robot"
 NUMBERS = st.integers(0, 2**64 - 1)
 LIVE = Outgoing(Kind.LIVE, BUS, 5)
+NO_CLOCK = struct.pack("<q", -(2**63))
 
 
 def batch(*samples: TransformStamped, origin: bytes = ONE, number: int = 1) -> OutgoingBatch:
@@ -119,6 +122,7 @@ batches = st.builds(
     st.sampled_from((ONE, OTHER)),
     NUMBERS,
     st.lists(some.samples(at=some.stamps(0, 2**31 * SECOND - 1)), min_size=1, max_size=4),
+    st.none() | st.integers(-(2**63) + 1, 2**63 - 1),
 )
 claims = st.builds(
     lambda one, other, digest, final, partial: Claim(min(one, other), max(one, other), digest, final, partial),
@@ -150,18 +154,36 @@ def test_a_message_is_read_as_it_was_written(out: Outgoing, entries: list[Any]) 
     for written, come in zip(entries, heard.entries, strict=True):
         if isinstance(written, OutgoingBatch):
             assert isinstance(come, ReceivedBatch)
+            assert come.clock == written.clock
+
+
+def test_the_stamps_that_a_link_has_corrected_are_written_as_their_sender_gave_them() -> None:
+    shifted = replace(batch(moving("map", "a", 107), static("map", "b", stamp=1)), shift=100)
+    come = read(write_message(LIVE, [shifted])).entries[0]
+    assert isinstance(come, ReceivedBatch)
+    assert [sample.stamp for sample in come.samples] == [7, 1]
+
+
+def test_the_section_of_clocks_is_taken_off_before_a_message_is_read() -> None:
+    section = write_section(5, None, [(b"8 bytes!", 6, 7)])
+    message = write_message(replace(LIVE, kind=Kind.SIGN, clocks=section))
+    assert split_clocks(message)[1] == section
+    assert read(split_clocks(message)[0]).number == 5
+    assert read_section(section, b"8 bytes!") == (5, None, (6, 7))
+    assert read_section(section, b"another!") == (5, None, None)
+    assert split_clocks(write_message(LIVE))[1] == b""
 
 
 def test_a_message_is_laid_out_as_its_module_says() -> None:
     a, b, c = moving("map", "a", 1, authority="slam"), static("map", "b"), static("map", "c", authority="slam")
-    entries: list[Entry] = [batch(a, a, b, c, number=7), RemovedFrame(OTHER, 8, "köln")]
+    entries: list[Entry] = [replace(batch(a, a, b, c, number=7), clock=77), RemovedFrame(OTHER, 8, "köln")]
     out = Outgoing(Kind.ANSWER, BUS, 5, Claim(6, 7, 8, partial=True), -9, [(OTHER, (ONE, BUS)), (ONE, ())], serves=True)
     assert write_message(out, entries) == (
         header(5, 1 + 2 + 4 + 8, 2, 2, 2, 2, claim=(6, 7, 8))
         + struct.pack("<q", -9)
         + (OTHER + b"\2" + ONE + BUS)
         + (ONE + b"\0")
-        + (ONE + OTHER)
+        + (ONE + struct.pack("<q", 77) + OTHER + NO_CLOCK)
         + (b"\4\0slam" + b"\0\0")
         + (entry(0, 0, 4, 7) + tags(0, 0, 3, 1))
         + (entry(1, 1, 5, 8) + "köln".encode())
@@ -279,18 +301,21 @@ def test_a_sample_that_no_message_can_hold_is_told_with_the_reason() -> None:
         (header(reach=1), "head"),
         (header(reach=1) + ONE + b"\2" + ONE, "head"),
         (header(reach=1) + ONE + bytes((LONGEST_WAY + 1,)) + ONE * (LONGEST_WAY + 1), "head"),
-        (header(origins=2) + ONE, "head"),
+        (header(origins=2) + ONE + NO_CLOCK + OTHER, "head"),
         (header(authorities=1) + b"\4\0slo", "head"),
         (header(authorities=1) + b"\1\0\xff", "head"),
-        (header(origins=1, entries=1) + ONE, "head"),
-        (header(origins=1, entries=1) + ONE + entry(2, 0, 0, 1), "head"),
-        (header(origins=1, entries=1) + ONE + entry(1, 1, 1, 1) + b"a", "head"),
-        (header(origins=1, entries=1) + ONE + entry(1, 0, 2, 1) + b"a", "head"),
-        (header(origins=1, entries=1) + ONE + entry(1, 0, 1, 1) + b"\xff", "head"),
-        (header(origins=1, entries=1) + ONE + entry(1, 0, 1_025, 1) + b"a" * 1_025, "head"),
-        (header(origins=1, entries=1) + ONE + entry(0, 0, 1, 1), "head"),
-        (header(origins=1, entries=1) + ONE + entry(0, 0, 1, 1) + tags(0), "head"),
-        (header(origins=1, authorities=1, entries=1) + ONE + b"\0\0" + entry(0, 0, 1, 1) + tags(0), "truncated"),
+        (header(origins=1, entries=1) + ONE + NO_CLOCK, "head"),
+        (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(2, 0, 0, 1), "head"),
+        (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(1, 1, 1, 1) + b"a", "head"),
+        (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(1, 0, 2, 1) + b"a", "head"),
+        (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(1, 0, 1, 1) + b"\xff", "head"),
+        (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(1, 0, 1_025, 1) + b"a" * 1_025, "head"),
+        (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(0, 0, 1, 1), "head"),
+        (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(0, 0, 1, 1) + tags(0), "head"),
+        (
+            header(origins=1, authorities=1, entries=1) + ONE + NO_CLOCK + b"\0\0" + entry(0, 0, 1, 1) + tags(0),
+            "truncated",
+        ),
         (header(entries=MAX_ENTRIES + 1), "oversized"),
         (header() + encode([moving("map", "a", 1)]), "tags"),
         (header() + b"x", "truncated"),
@@ -310,12 +335,12 @@ def test_nothing_of_a_large_message_that_is_malformed_at_its_end_is_a_part() -> 
 
 
 def test_a_message_with_too_many_samples_is_refused_before_they_are_decoded() -> None:
-    head = header(origins=1, authorities=1, entries=1) + ONE + b"\0\0" + entry(0, 0, MAX_SAMPLES + 1, 1)
+    head = header(origins=1, authorities=1, entries=1) + ONE + NO_CLOCK + b"\0\0" + entry(0, 0, MAX_SAMPLES + 1, 1)
     assert reason_of(head) == "oversized"
 
 
 def test_counts_that_lie_cost_little_memory() -> None:
-    data = header(origins=1, authorities=1, entries=1) + ONE + b"\0\0" + entry(0, 0, MAX_SAMPLES, 1)
+    data = header(origins=1, authorities=1, entries=1) + ONE + NO_CLOCK + b"\0\0" + entry(0, 0, MAX_SAMPLES, 1)
     assert peak_of(lambda: reason_of(data)) < 100_000
     for lie in ({"reach": 255}, {"origins": 65_535}, {"authorities": 65_535}, {"entries": MAX_ENTRIES}):
         assert peak_of(lambda lie=lie: reason_of(header(**lie))) < 10_000_000  # type: ignore[misc]

@@ -14,7 +14,7 @@ from support.samples import moving, static
 
 from tfbus import PeerLost, PeerRejected, TransformStamped
 from tfbus.links.endpoint import MAX_AUTHORITIES
-from tfbus.links.message import Kind, Outgoing, read_message, write_body, write_message, write_text
+from tfbus.links.message import VERSION, Kind, Outgoing, read_message, write_body, write_message, write_text
 from tfbus.links.relay import LARGEST_JUMP
 from tfbus.links.replica import MANY_ORIGINS, Claim, OutgoingBatch, RemovedFrame
 
@@ -219,8 +219,8 @@ def test_what_no_message_can_say_is_counted_and_told_once_for_each_peer_and_reas
         for bad in (
             b"",
             b"garbage",
-            b"\4\1",
-            b"\4\1",
+            bytes((VERSION, Kind.LIVE)),
+            bytes((VERSION, Kind.LIVE)),
             write_body(Kind.QUESTION, b"[]"),
             write_body(Kind.QUESTION, b""),
         ):

@@ -128,6 +128,13 @@ async def test_samples_are_published_as_they_were_recorded(tmp_path: Path) -> No
     assert (player.played, player.messages, player.passes, player.bad) == (4, 3, 1, {})
 
 
+async def test_an_offset_moves_the_stamps_of_moving_samples(bus: Bus, tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", (START, (static("map", "rig"), moving("map", "base", 7, 1.0))))
+    heard = Listener(bus)
+    await Player(bus, path, rate=AS_FAST_AS_POSSIBLE, offset=1e-8).play()
+    assert heard.batches == [(static("map", "rig"),), (moving("map", "base", 17, 1.0),)]
+
+
 async def test_a_task_that_a_message_wakes_sees_all_messages_of_that_log_time(tmp_path: Path) -> None:
     frames = ["base", *(f"f{number}" for number in range(9))]
     lines = [(received, "/tf", [moving("map", frame, received)]) for received in (5, 7) for frame in frames]

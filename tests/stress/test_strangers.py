@@ -128,7 +128,7 @@ def false_counts(_: Scene) -> Iterator[bytes]:
     ]:
         yield HEAD.pack(VERSION, 1, 0, ways, origins, authorities, entries, 1, BUS, 0, 0, 0) + bytes(2_000)
     empty = struct.pack("<BHHQ", 0, 0, 10_000, 1) + bytes(20_000)
-    yield HEAD.pack(VERSION, 1, 0, 0, 1, 1, 2, 1, BUS, 0, 0, 0) + BUS + struct.pack("<H", 0) + empty * 2
+    yield HEAD.pack(VERSION, 1, 0, 0, 1, 1, 2, 1, BUS, 0, 0, 0) + BUS + bytes(10) + empty * 2
 
 
 def ill_questions(_: Scene) -> Iterator[bytes]:

@@ -13,8 +13,9 @@ from typing import Any
 
 from support.foreign_world import ForeignCarrier, ForeignMessage, ForeignWorld
 
-from tfbus import Bus, SimulatedClock, Transform, TransformStamped, UnknownFrameError
+from tfbus import Bus, SimulatedClock, SystemClock, Transform, TransformStamped, UnknownFrameError
 from tfbus.geometry.stamped import Batch
+from tfbus.links.clocks import OwnClock
 from tfbus.links.domain import DomainEnd
 from tfbus.links.endpoint import Endpoint
 from tfbus.links.link import ReceiveQueue
@@ -34,6 +35,24 @@ def finish(call: Coroutine[Any, Any, object]) -> None:
     """Run a coroutine that never waits."""
     with suppress(StopIteration):
         call.send(None)
+
+
+class SkewedClock(SystemClock):
+    """A clock of a world that is ahead by some s, and gains some s a s; it can be set."""
+
+    def __init__(self, world: "World", ahead: float = 0.0, drift: float = 0.0) -> None:
+        self._world = world
+        self._began = world.now
+        self.ahead = ahead
+        self.drift = drift
+
+    def now(self) -> int:
+        return round((self._world.now + self.offset) * SECOND)
+
+    @property
+    def offset(self) -> float:
+        """The s by which it is ahead of the time of the world."""
+        return self.ahead + self.drift * (self._world.now - self._began)
 
 
 class World:
@@ -106,6 +125,7 @@ class Network:
         self.world = world
         self.wires: list[Wire] = []
         self.loss = 0.0
+        self.delay: Callable[[Wire, Wire], float] = lambda *_: world.random.uniform(0.0001, 0.005)
         self.cuts: set[tuple[Wire, Wire]] = set()
         self.carried: list[tuple[Kind | None, int]] = []
 
@@ -215,7 +235,7 @@ class Wire:
             return False
         self.network.carried.append((kind_of(message), len(message)))
         if world.random.random() >= self.network.loss:
-            other.bring(self.id, message, world.random.uniform(0.0001, 0.005))
+            other.bring(self.id, message, self.network.delay(self, other))
         return True
 
     def bring(self, sender: str, item: WireItem, delay: float = 0.0) -> None:
@@ -327,7 +347,13 @@ class Process:
         options: dict[str, Any],
     ) -> None:
         self.world = world
-        self.bus = Bus(SimulatedClock(int(world.now * SECOND)), max_ahead=None)
+        clock: SkewedClock | None = options.pop("clock", None)
+        corrects: bool = options.pop("corrects", False)
+        self.bus = Bus(clock or SimulatedClock(int(world.now * SECOND)), max_ahead=None)
+        if clock is not None:
+            # Machines count from when they were started.
+            started = world.random.randint(-(10**15), 10**15)
+            relay_of(self.bus).clock = OwnClock(clock, lambda: round(world.now * SECOND) + started)
         # The relay draws it elsewhere, and a run has to be given by its seed.
         relay_of(self.bus).replica.origin = world.random.randbytes(16)
         self.networks = networks
@@ -339,6 +365,8 @@ class Process:
         self.wires = [Wire(network, options.get("robot", "")) for network in networks]
         make: dict[str, Any] = {"drop_lost": drop_lost, "now": lambda: world.now, **options}
         self.domain_ends = [DomainEnd(self.bus, "tf", wire, **make) for wire in self.wires]
+        for end in self.domain_ends:
+            end.clocks.corrects = corrects
         carriers = [ForeignCarrier(place, f"bus {len(world.processes)}.{k}") for k, place in enumerate(worlds)]
         self.foreign_ends = [ForeignEnd(self.bus, "world", carrier, drop_lost=drop_lost) for carrier in carriers]
         self.ends: list[Endpoint] = [*self.domain_ends, *self.foreign_ends]

@@ -1,13 +1,14 @@
 """Measurements of samples as they arrive: rates, delays, gaps and losses of each frame and sender."""
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from tfbus.geometry.stamped import Batch
-from tfbus.stamps import SECOND, from_seconds, time_between
+from tfbus.stamps import SECOND, format_duration, from_seconds, time_between
 
 _WEIGHT = 0.1
 """The weight of the newest sample in the mean."""
@@ -58,9 +59,9 @@ class Arrival:
         The samples in the window.
     rate : float or None
         Arrivals a second.
-    delay_mean, delay_p99, delay_max : float or None
-        The mean, the 99th percentile and the maximum of arrival minus stamp; negative if the clock of the sender is
-        ahead.
+    delay_mean, delay_p99, delay_max, delay_min : float or None
+        The mean, the 99th percentile, the maximum and the minimum of arrival minus stamp; negative if the clock of the
+        sender is ahead.
     jitter : float or None
         The standard deviation of the time between two arrivals.
     longest_gap : float or None
@@ -94,6 +95,7 @@ class Arrival:
     longest_gap: float | None
     late: int
     lost: int
+    delay_min: float | None = None
 
 
 class Arrivals:
@@ -198,11 +200,51 @@ class _Received:
             delay_mean=float(delays.mean()),
             delay_p99=float(delays[-(-99 * count // 100) - 1]),
             delay_max=float(delays[-1]),
+            delay_min=float(delays[0]),
             jitter=float(periods.std()) if count > 1 else None,
             longest_gap=max(float(periods.max(initial=0.0)), (now - int(arrived[-1])) / SECOND),
             late=int(np.count_nonzero(stamps[1:] < np.maximum.accumulate(stamps)[:-1])),
             lost=_lost(time_between((different := np.unique(stamps))[:-1], different[1:])),
         )
+
+
+_ANOTHER_CLOCK: Final = 1e8
+_AHEAD: Final = 1e-3
+_LATE: Final = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class SenderDelay:
+    """The evidence that arrivals alone give of the clock of a sender that answers nothing.
+
+    Attributes
+    ----------
+    authority : str
+    delay : float
+        The smallest time from a stamp to the arrival of its sample within the window, in s. The clock of the sender is
+        behind by this much less the unknown time that its samples take.
+    """
+
+    authority: str
+    delay: float
+
+    @property
+    def remark(self) -> str:
+        """The conclusion in words; empty if there is none."""
+        if abs(self.delay) > _ANOTHER_CLOCK:
+            return "another clock (simulated?)"
+        if self.delay < -_AHEAD:
+            return f"its clock is at least {format_duration(from_seconds(-self.delay))} ahead of this one"
+        return "late, or its clock is behind this one" if self.delay > _LATE else ""
+
+
+def sender_delays(arrivals: Iterable[Arrival]) -> list[SenderDelay]:
+    """The smallest delay of each sender, sorted by their names."""
+    least: dict[str, float] = {}
+    for arrival in arrivals:
+        if arrival.delay_min is not None:
+            least[arrival.authority] = min(arrival.delay_min, least.get(arrival.authority, arrival.delay_min))
+    return [SenderDelay(authority, delay) for authority, delay in sorted(least.items())]
 
 
 def _lost(steps: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> int:

@@ -22,6 +22,7 @@ ADVICE = {
     "jump": "the sender has reset, or mixes two estimates: look at it, or leave these out with max_speed=",
     "turn": "the sender has reset, or two estimates disagree: look at its state then",
     "stamps go back": "messages overtake each other, or a clock was set back: use one sender, and one clock",
+    "clock": "synchronise the two clocks, by chrony or NTP, or move the stamps by an offset",
     "ahead": "the clock of the sender is ahead of the recorder's clock: synchronise them",
     "duplicate stamps": "the last one wins: give each transform a stamp of its own, or send it once",
     "gap": "lookups interpolate across it: look for what stopped the sender, or refuse with max_gap=",
@@ -292,6 +293,59 @@ class MovingSamples:
         yield Finding(kind, self.frame, len(places), first, float(values[worst]), unit, detail, int(stamps[worst]))
 
 
+_ANOTHER_CLOCK = 1e8
+_FIT = 20
+"""The windows of a fit; the smallest delay in each is least disturbed by the network."""
+_SHORTEST_FIT = 60.0
+_LEAST_DRIFT = 20e-6
+
+
+@dataclass(frozen=True, slots=True)
+class ClockFit:
+    """The clock of a sender beside the clock that the arrivals were noted by, as far as one-way delays tell.
+
+    Attributes
+    ----------
+    authority : str
+    ahead : float
+        How far it is ahead, in s, at least: the smallest time from an arrival to its stamp, with the sign changed.
+    drift : float or None
+        How fast it gains, in s per s; None for less than a minute, or where the delays leave it open.
+    """
+
+    authority: str
+    ahead: float
+    drift: float | None
+
+    @classmethod
+    def of(cls, authority: str, stamps: npt.NDArray[np.int64], received: npt.NDArray[np.int64]) -> "ClockFit":
+        """The line through the greatest leads of some windows of the arrivals, least squares."""
+        order = np.argsort(received, kind="stable")
+        times, leads = received[order], time_between(received, stamps)[order] / SECOND
+        at = time_between(np.broadcast_to(times[0], times.shape), times) / SECOND
+        span, drift = float(at[-1]), None
+        if span >= _SHORTEST_FIT:
+            window = np.minimum((at / span * _FIT).astype(np.int64), _FIT - 1)
+            windows = (np.flatnonzero(window == number) for number in range(_FIT))
+            best = [part[np.argmax(leads[part])] for part in windows if len(part)]
+            if len(best) > _FIT // 2:
+                x, y = at[best] - at[best].mean(), leads[best] - leads[best].mean()
+                slope = float((x * y).sum() / (x * x).sum())
+                noise = float(np.sqrt(((y - slope * x) ** 2).mean() / (x * x).sum()))
+                if abs(slope) > max(_LEAST_DRIFT, 6 * noise):
+                    drift = slope
+        return cls(authority, float(leads.max()), drift)
+
+    def __str__(self) -> str:
+        if abs(self.ahead) > _ANOTHER_CLOCK:
+            return f"{self.authority!r} stamps by another clock (simulated?)"
+        side = "ahead, or more" if self.ahead >= 0 else "behind, or less"
+        text = f"the clock of {self.authority!r} is {abs(self.ahead):.3g} s {side}"
+        if self.drift is None:
+            return text
+        return f"{text}, and {'gains' if self.drift > 0 else 'loses'} {abs(self.drift) * 1e6:.0f} us a second"
+
+
 _SHOWN = 5
 _MANY = 10
 """The least number of samples in one place that prove that a frame never moves."""
@@ -395,8 +449,21 @@ class Examiner:
         if len(roots) > 1:
             shown = ", ".join(map(repr, roots[:_SHOWN])) + (", ..." if len(roots) > _SHOWN else "")
             yield Finding("disconnected", None, len(roots), None, None, "", f"separate trees, below {shown}")
+        yield from self._of_clocks()
         for reason, count in sorted(self._refused.items()):
             yield Finding("refused", None, count, None, None, "", f"not accepted: {reason}")
+
+    def _of_clocks(self) -> Iterator[Finding]:
+        arrivals: dict[str, list[npt.NDArray[np.int64]]] = {}
+        for frame in self._frames.values():
+            for authority, times in frame.arrivals():
+                arrivals.setdefault(authority, []).append(times)
+        for authority, parts in sorted(arrivals.items()):
+            stamps, received = np.concatenate(parts, axis=1)
+            fit = ClockFit.of(authority, stamps, received)
+            usual = float(np.quantile(time_between(received, stamps), 0.1)) / SECOND
+            if usual > self._limits.ahead or fit.drift is not None or fit.ahead < -_ANOTHER_CLOCK:
+                yield Finding("clock", None, len(stamps), None, fit.ahead, "s", str(fit))
 
 
 class _Frame:
@@ -439,6 +506,15 @@ class _Frame:
         self._authority_numbers.append(authority_number)
         if self._newest is None or stamp >= self._newest:
             self._newest, self.parent = stamp, parent
+
+    def arrivals(self) -> Iterator[tuple[str, npt.NDArray[np.int64]]]:
+        """The stamps and arrivals of each sender of moving samples, two rows in ns."""
+        if not self._stamps or len(self._received) < len(self._stamps):
+            return
+        times, numbers = np.array([self._stamps, self._received], np.int64), np.array(self._authority_numbers, np.int64)
+        for authority, number in self._authorities.items():
+            if (chosen := numbers == number).any():
+                yield authority, times[:, chosen]
 
     def findings(self, limits: Limits) -> Iterator[Finding]:
         """All faults of this frame."""

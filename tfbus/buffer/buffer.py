@@ -748,6 +748,8 @@ class Buffer:
         )
         for error in found.errors:
             self._lookups.complete(error, max_age, bounds)
+        edges = (replace(edge, clock=self.bus._clock_of(edge.child)) for edge in found.edges)
+        found = replace(found, edges=tuple(edges))
         return found if self._local_names is None else self._local_names.explanation(found, target, source)
 
     def pending(self) -> tuple[PendingLookup, ...]:

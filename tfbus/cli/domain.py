@@ -97,6 +97,9 @@ class LinkOptions:
         May be given several times.
     tf_prefix
         With --ros, a prefix for the names of all frames that come from there, such as robot1/.
+    ros_offset
+        With --ros, seconds that are added to each stamp that comes from there, such as -0.3 for a robot whose clock is
+        0.3 s ahead.
     backend
         The event loop to run on.
     """
@@ -109,6 +112,7 @@ class LinkOptions:
     ros: tuple[str, ...] = ()
     tf: tuple[str, ...] = ()
     tf_prefix: str | None = None
+    ros_offset: float = 0.0
     backend: Backend = "asyncio"
 
     @property
@@ -170,8 +174,8 @@ class LinkOptions:
             If an option is not valid, an address cannot be listened at or reached, or the extra is missing.
         """
         follower = bus.clock if isinstance(bus.clock, ReplayClock) else None
-        if not self.ros and (self.tf or self.tf_prefix is not None):
-            raise UsageError("--tf and --tf-prefix are for ROS: give --ros, such as --ros dds")
+        if not self.ros and (self.tf or self.tf_prefix is not None or self.ros_offset):
+            raise UsageError("--tf, --tf-prefix and --ros-offset are for ROS: give --ros, such as --ros dds")
         if self.ros:
             async with AsyncExitStack() as stack:
                 links = []
@@ -199,7 +203,7 @@ class LinkOptions:
             topics = {"joint_topic": "joint_states", "description_topic": "robot_description"}
             options |= {option: f"{namespace}/{topic}" for option, topic in topics.items()}
             options |= {"tf": self.tf, "tf_static": [f"{topic}_static" for topic in self.tf]}
-        return ros_link(bus, place, prefix=self.tf_prefix, **options)
+        return ros_link(bus, place, prefix=self.tf_prefix, offset=self.ros_offset, **options)
 
     def run_remote(self, program: Callable[[RemoteLookups], Awaitable[T]]) -> T:
         """Run a program that asks the buffer of the robot in `robots`, in another process, until its end.

@@ -72,6 +72,8 @@ class TransformStamped(Sample):
     """
 
     __slots__ = ()
+    _is_plain = True
+    """Whether it knows nothing beyond its fields. The kernel hands other samples back."""
     __match_args__ = ("parent", "child", "stamp", "transform", "authority", "static")
 
     def __init__(
@@ -434,3 +436,25 @@ def not_physical(sample: TransformStamped, bound: float) -> InvalidTransformErro
         child=child,
         authority=authority,
     )
+
+
+def shifted(sample: TransformStamped, nanoseconds: int) -> TransformStamped:
+    """A sample with its stamp moved; a static one is returned itself, because it holds at every stamp.
+
+    Raises
+    ------
+    InvalidTransformError
+        If the stamp does not fit 64 bits then.
+    """
+    parent, child, stamp, row, authority, static = sample._fields
+    if static:
+        return sample
+    stamp += nanoseconds
+    if not STAMP_MIN <= stamp <= STAMP_MAX:
+        why = f"the stamp of frame {child!r} and the offset of its source do not fit 64 bits"
+        raise InvalidTransformError(why, reason="stamp", parent=parent, child=child, authority=authority)
+    kind = TransformStamped if sample._is_plain else type(sample)
+    moved = kind.__new__(kind)
+    moved._fields = parent, child, stamp, row, authority, static
+    moved._take(sample)
+    return moved

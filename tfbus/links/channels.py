@@ -101,12 +101,12 @@ class Channels:
             else:
                 channel.number += 1
 
-    def sign(self, view: View, now: float, reach: Sequence[Way], serves: bool) -> None:
+    def sign(self, view: View, now: float, reach: Sequence[Way], serves: bool, clocks: bytes) -> None:
         """Publish a sign of life on each channel."""
         for channel in list(self._channels):
             if self._is_heard(channel, now):
                 claim = view.claim(now, channel.frames)._replace(partial=self._partial)
-                sign = Outgoing(Kind.SIGN, self._bus, channel.number, claim, self._time, reach, serves)
+                sign = Outgoing(Kind.SIGN, self._bus, channel.number, claim, self._time, reach, serves, clocks)
                 first, *others = channel.names
                 self._wire.publish(first, write_message(sign))
                 if others:
@@ -147,7 +147,7 @@ class Channels:
                 fields = sample._fields
                 newest.pop(fields[1], None)
                 if not fields[5]:
-                    newest[fields[1]] = OutgoingBatch(entry.origin, entry.sequence, (sample,))
+                    newest[fields[1]] = OutgoingBatch(entry.origin, entry.sequence, (sample,), entry.clock, entry.shift)
 
     def _write(self, channel: _Channel, entries: Sequence[Entry]) -> None:
         """One message of all entries if possible, else several; a batch that is too large is left out and reported."""

@@ -9,11 +9,15 @@ from time import monotonic
 from typing import Any, TypedDict
 
 from tfbus.bus.bus import Bus
+from tfbus.events import ClockOffset, PeerClockStepped
 from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
+from tfbus.links.clocks import Clocks
 from tfbus.links.endpoint import MAX_PEERS, Endpoint
 from tfbus.links.history import LONGEST_HISTORY, HistoryAsker, chunk_of_past
 from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import (
+    END_OF_STAMPS,
+    FIRST_STAMP,
     LONGEST_WAY,
     Heard,
     Kind,
@@ -24,6 +28,7 @@ from tfbus.links.message import (
     read_fields,
     read_message,
     sendable,
+    split_clocks,
     write_message,
     write_text,
 )
@@ -41,7 +46,8 @@ from tfbus.links.replica import (
     View,
 )
 from tfbus.links.seams import Hearing, Joined, Left, Received, Wire, WireItem
-from tfbus.stamps import as_duration
+from tfbus.stamps import SECOND, as_duration, to_seconds
+from tfbus.statistics import PeerClock
 from tfbus.tf_message import MalformedMessageError
 
 SIGN_PERIOD = 1.0
@@ -74,6 +80,7 @@ class EndOptions(TypedDict, total=False):
     drop_lost: bool
     max_frames: int
     history: float | None
+    max_offset: float
 
 
 class DomainEnd(Endpoint):
@@ -95,6 +102,7 @@ class DomainEnd(Endpoint):
     own : View
         The frames that the links of this robot bring.
     lookups : RemoteLookups
+    clocks : Clocks
     """
 
     own: View
@@ -112,6 +120,7 @@ class DomainEnd(Endpoint):
         drop_lost: bool = False,
         max_frames: int = 10_000,
         history: float | None = None,
+        max_offset: float = 0.02,
         now: Callable[[], float] = monotonic,
     ) -> None:
         if isinstance(robots, str):
@@ -139,6 +148,8 @@ class DomainEnd(Endpoint):
         self._channels = Channels(wire, self._bus, self.frames is not None, slow_rate, self.report)
         self.own: View = self._view_of(self._robot)
         self._agreement = Agreement()
+        self.max_offset: float = as_duration(max_offset, "max_offset") * SECOND
+        self.clocks: Clocks = Clocks(self.relay.clock, self.id, max_offset)
         self._history = HistoryAsker(history or 0.0, wire.send, now)
         self.lookups: RemoteLookups = RemoteLookups(wire.send, name)
         # The last sign of each peer that agrees with this link: the same sign once more need not wake the event loop.
@@ -219,6 +230,9 @@ class DomainEnd(Endpoint):
         self.lookups.server = server
         self.sign_soon()
 
+    def clock_statistics(self) -> tuple[PeerClock, ...]:
+        return self.clocks.statistics((link, self.peers[link].authorities) for link in self.present)
+
     # For the relay
 
     def ways(self) -> Iterator[Way]:
@@ -248,7 +262,8 @@ class DomainEnd(Endpoint):
     def _sign(self, now: float) -> None:
         self._signed_at, self._sign_due = now, now + self._sign_period
         self.send()
-        self._channels.sign(self.own, now, self._reach(), self._serves)
+        self._channels.sign(self.own, now, self._reach(), self._serves, self.clocks.section(answers=True))
+        self._tell_offsets()
 
     def _reach(self) -> list[Way]:
         besides = self.relay.reach_besides(self)
@@ -258,7 +273,8 @@ class DomainEnd(Endpoint):
         """Send a new peer the entries that this link brings, or an empty meeting if they are too many."""
         self.send()
         claim = self.own.claim(self._now())._replace(partial=self.frames is not None)
-        out = Outgoing(Kind.MEETING, self._bus, 0, claim, self.time, self._reach(), self._serves)
+        clocks = self.clocks.section(answers=False)
+        out = Outgoing(Kind.MEETING, self._bus, 0, claim, self.time, self._reach(), self._serves, clocks)
         entries = [known.told for known in islice(self.own.brought(self), CHUNK + 1)]
         try:
             message = write_message(out, entries if len(entries) <= CHUNK else ())
@@ -271,8 +287,11 @@ class DomainEnd(Endpoint):
     def take(self, link: str, item: WireItem) -> None:
         """Take an item of the wire, from any thread."""
         if isinstance(item, bytes):
-            kind = kind_of(item)
-            if kind is Kind.SIGN and self._resting.get(link) == item:
+            kind, is_steady = kind_of(item), True
+            if kind in (Kind.SIGN, Kind.MEETING):
+                item, section = split_clocks(item)
+                is_steady = not section or self.clocks.arrive(link, section)
+            if kind is Kind.SIGN and is_steady and self._resting.get(link) == item:
                 return
             urgent = kind in _URGENT
             received = Received(link, item, len(item), kind is Kind.LIVE, urgent, kind in _FOLLOWS)
@@ -283,6 +302,7 @@ class DomainEnd(Endpoint):
     def _joined(self, sender: str, joined: Joined) -> None:
         peer = self._join(sender, joined.robot)
         if peer is not None:
+            self.clocks.joined(sender)
             peer.rate = next((rate for one, rate in self._rates.items() if one.matches(peer.robot)), inf)
             self._meet(peer)
             self._sign_sooner()
@@ -290,7 +310,8 @@ class DomainEnd(Endpoint):
             if peer.rate:
                 # A peer hears of a filter by the first question.
                 self._agreement.joined(sender, self._view_of(peer.robot), self._now(), must_ask=self._filters)
-                self._history.joined(sender)
+                if not self.clocks.corrects:
+                    self._history.joined(sender)
             self.host.stir()
         elif sender not in self.peers and len(self._waiting) < MOST_WAITING:
             self._waiting[sender] = joined
@@ -336,6 +357,7 @@ class DomainEnd(Endpoint):
             self._update_ways(peer, heard)
             if heard.kind in (Kind.SIGN, Kind.MEETING):
                 self.lookups.note_server(sender, peer.robot, heard.serves)
+                self._settle_clocks(peer)
                 if not peer.rate:
                     return
             if heard.kind is not Kind.SIGN:
@@ -383,6 +405,11 @@ class DomainEnd(Endpoint):
             self.relay.heard(entry.sequence)
             source = Provenance(entry.origin, entry.sequence, self, peer)
             if isinstance(entry, ReceivedBatch):
+                if self._place(peer, source, entry, heard):
+                    # The samples before the step are published before those behind it.
+                    self._publish(together, heard.kind)
+                    together = []
+                    self._begin_anew(peer, source)
                 # The authorities of a bus beyond the peer do not count as the peer's.
                 if entry.origin in peer.paths and not self._admit_authorities(peer, entry.samples):
                     continue
@@ -401,6 +428,70 @@ class DomainEnd(Endpoint):
                 news = self._remove(view, source, entry.frame) or news
         self._publish(together, heard.kind)
         return news
+
+    def _place(self, peer: Peer, source: Provenance, entry: ReceivedBatch, heard: Heard) -> bool:
+        """Note the clock of a batch, and correct its stamps; returns whether they do not go on from those before."""
+        source.told = entry.clock
+        source.clock = self.clocks.goes_on(peer.id, entry.origin, entry.clock)
+        if source.clock is not None:
+            return False
+        moving = [sample for sample in entry.samples if not sample._fields[5]]
+        self._correct(peer, source, moving, direct=entry.origin == heard.bus)
+        is_live = heard.kind is Kind.LIVE and bool(moving)
+        return is_live and self.clocks.jumps(peer.id, entry.origin, entry.clock, source.clock, source.shift)
+
+    def _correct(
+        self, peer: Peer, source: Provenance, moving: Sequence[ReceivedTransform], *, direct: bool = False
+    ) -> None:
+        """Find the clock of a source, and if stamps are to be corrected, move those of its samples, which are new."""
+        source.clock, shift = self.clocks.place(peer.id, source.told, direct=direct)
+        if shift and all(FIRST_STAMP <= sample._fields[2] + shift < END_OF_STAMPS for sample in moving):
+            source.shift = shift
+            for sample in moving:
+                parent, child, stamp, row, authority, static = sample._fields
+                sample._fields = parent, child, stamp + shift, row, authority, static
+
+    def _settle_clocks(self, peer: Peer) -> None:
+        """Read what signs have told of clocks; once that of a peer is known, correct what it told before."""
+        self.clocks.settle()
+        self._tell_offsets()
+        is_measured = self.clocks.is_measured(peer.id)
+        if peer.is_placed or is_measured is False:
+            return
+        peer.is_placed = True
+        for known in list(self.relay.replica.entries.values()) if is_measured else ():
+            source, sample = known.source, known.sample
+            if source.peer is not peer or source.clock is not None or not isinstance(sample, ReceivedTransform):
+                continue
+            # Others may hold the sample as it came.
+            moved = sample.again()
+            self._correct(peer, source, () if sample.static else (moved,))
+            if source.shift and not sample.static:
+                known.sample = moved
+                if known.shown is not None and not self.bus.closed:
+                    self.relay.remove(known.frame, None)
+        if self.clocks.corrects and peer.rate:
+            self._history.joined(peer.id)
+        if self.clocks.corrects and not self._history.open:
+            self._show()
+
+    def _begin_anew(self, peer: Peer, source: Provenance) -> None:
+        """Forget the older samples of a bus whose stamps have jumped, because the newer ones do not go on from them."""
+        frames = self.relay.begin_anew(source.origin)
+        step = self.clocks.step_of(source.origin)
+        if step:
+            self.bus._announce(PeerClockStepped(self.bus.clock.now(), self.name, peer.id, to_seconds(step), frames))
+
+    def _tell_offsets(self) -> None:
+        """Announce the clocks that have begun to differ from this one, or no longer do."""
+        for link, offset, bound, over in self.clocks.news():
+            peer = self.peers.get(link)
+            if peer is None:
+                continue
+            authorities = tuple(sorted(peer.authorities))
+            event = ClockOffset(self.bus.clock.now(), self.name, link, authorities, offset, bound, over)
+            self.bus._announce(event)
+            self._log.warning(("clock", link, over), "%s", event)
 
     def _remove(self, view: View, source: Provenance, frame: str) -> bool:
         """Note a removal; returns whether it was news for the map."""
@@ -509,6 +600,7 @@ class DomainEnd(Endpoint):
         self._end_history(peer.id)
         self._agreement.left(peer.id)
         self.lookups.left(peer.id)
+        self.clocks.left(peer.id)
         self._resting.pop(peer.id, None)
         self._forget_robots(peer.robot)
         _, lost = self.relay.reach_changed(self) if peer.paths else ((), set[bytes]())

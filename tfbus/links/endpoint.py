@@ -19,6 +19,7 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.relay import REMEMBERED_REASONS, Outbox, Peer, Relay, relay_of
 from tfbus.links.replica import Entry
 from tfbus.links.seams import Joined, Left, Network, Received, SendReport
+from tfbus.statistics import PeerClock
 from tfbus.tf_message import MalformedMessageError
 
 MAX_PEERS = 1_000
@@ -127,6 +128,10 @@ class Endpoint(Outbox, ABC):
     def clock_jumped_back(self) -> None:
         """Take samples with the stamps of earlier ones for news."""
         self.relay.clock_jumped_back()
+
+    def clock_statistics(self) -> tuple[PeerClock, ...]:
+        """The clocks of the peers, as far as they tell their times."""
+        return ()
 
     def tell_time(self, stamp: int) -> None:
         """Tell peers the time of this bus's clock, in ns, with all that is published from now on."""

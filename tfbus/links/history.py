@@ -54,7 +54,8 @@ def chunk_of_past(bus: Bus, brought: Iterable[Known], seconds: float, after: str
             continue
         if told and count + len(samples) > CHUNK:
             return told, False
-        told.append(OutgoingBatch(known.source.origin, known.source.sequence, samples))
+        source = known.source
+        told.append(OutgoingBatch(source.origin, source.sequence, samples, source.clock, source.shift))
         count += len(samples)
     return told, True
 

@@ -294,6 +294,7 @@ class Link(AsyncOnly):
             not_sent=dict(end.report.not_sent),
             rejected=dict(end.rejected),
             queue=self._receive_queue.statistics(),
+            clocks=end.clock_statistics(),
         )
 
     async def __aenter__(self) -> Self:
@@ -439,6 +440,7 @@ class DomainOptions(EndOptions, total=False):
     capacity: int
     clock: SimulatedClock | HearsTime | None
     tell_clock: bool
+    correct_clocks: bool
 
 
 class DomainLink(Link):
@@ -480,6 +482,11 @@ class DomainLink(Link):
         time is followed until it is lost; the time of others is refused and counted.
     tell_clock : bool
         Whether to tell peers the time of the bus's clock, which is a `SimulatedClock`.
+    max_offset : float
+        A peer's clock may be so many s ahead of the bus's clock or behind it; beyond that, `ClockOffset` tells of it.
+    correct_clocks : bool
+        Whether the stamps of other buses are moved to the clock of this one as they arrive, by the measured offset; the
+        guide's page on clocks tells when that helps.
 
     Attributes
     ----------
@@ -526,11 +533,17 @@ class DomainLink(Link):
         capacity: int = 10_000,
         clock: SimulatedClock | HearsTime | None = None,
         tell_clock: bool = False,
+        correct_clocks: bool = False,
         **options: Unpack[EndOptions],
     ) -> None:
         self.domain: str = check_domain(domain)
         self.robot: str | None = options.get("robot")
         self._domain_end = DomainEnd(bus, domain, wire, **options)
+        if correct_clocks and not self._domain_end.clocks.own.runs:
+            raise TypeError(
+                f"to correct the stamps of others, the bus needs a clock that runs by itself, not {bus.clock!r}"
+            )
+        self._domain_end.clocks.corrects = correct_clocks
         super().__init__(self._domain_end, capacity=capacity, clock=clock, tell_clock=tell_clock)
 
     @property

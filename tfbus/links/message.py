@@ -7,12 +7,13 @@ sender holds. The samples themselves are a TFMessage behind that. Little endian:
     since u64, sequence u64, digest u64: a `Claim`
     time         i64, the time of the sender's clock in ns, if the flags say so
     reach        origin 16 bytes, length u8, and so many buses on the way there, 16 bytes each
-    origins      16 bytes each
+    origins      16 bytes each, and the base of the clock of its batches in ns, i64; the least one if it is unknown
     authorities  length u16, UTF-8
     entries      kind u8, origin u16, samples u16, sequence u64, and then
         batch    for each sample: twice the place of its authority, and one more for a static one, u16
         removal  the length of the name in place of samples, UTF-8
     samples      a TFMessage with the samples of all batches, in their order
+    clocks       the section of `tfbus.links.clocks`, if the flags say so
 
 The kinds are those of `tfbus.links.replica`, and those of the past and of lookups. Questions are JSON behind version
 and kind. A question of a lookup and its answer have a number of 8 bytes before the JSON, by which an answer finds its
@@ -42,12 +43,13 @@ from tfbus.errors import (
     TransformLookupError,
 )
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.links.clocks import split_section
 from tfbus.links.replica import Claim, Entry, OutgoingBatch, ReceivedBatch, ReceivedTransform, RemovedFrame
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
 from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode, decode_in_parts, encode, refusal
 
-VERSION = 4
+VERSION = 5
 MAX_BYTES = 2**22
 """The largest message with samples that is sent or read."""
 MAX_HEAD = 2**20
@@ -67,7 +69,7 @@ _PART = 200
 """The samples or entries of a large message that are handled before other tasks may have their turn."""
 _PART_OF_HEAD = 1_000
 _LONGEST_AUTHORITY = 65_535
-_FIRST_STAMP, _END_OF_STAMPS = -(2**31) * SECOND, 2**31 * SECOND
+FIRST_STAMP, END_OF_STAMPS = -(2**31) * SECOND, 2**31 * SECOND
 _HELD: set[tuple[str, str, str]] = set()
 """Parents, children and authorities that a message can hold, of the last calls of `can_hold`."""
 _MOST_HELD = 2_000
@@ -82,8 +84,10 @@ _HEADER = struct.Struct("<BBBBHHIQ16sQQQ")
 _ENTRY = struct.Struct("<BHHQ")
 _LENGTH = struct.Struct("<H")
 _TIME = struct.Struct("<q")
+_ORIGIN = struct.Struct("<16sq")
 _BATCH, _REMOVAL = 0, 1
-_FINAL, _PARTIAL, _HAS_TIME, _SERVES = 1, 2, 4, 8
+_FINAL, _PARTIAL, _HAS_TIME, _SERVES, _HAS_CLOCKS = 1, 2, 4, 8, 16
+_NO_CLOCK = -(2**63)
 _BUS = 16
 
 NOTHING = Claim(0, 0, 0)
@@ -124,6 +128,8 @@ class Outgoing:
     reach : sequence of Way
     serves : bool
         Whether the sender answers lookups.
+    clocks : bytes
+        The section of `tfbus.links.clocks` at the end of a sign or a meeting; `split_clocks` takes it off.
     """
 
     kind: Kind
@@ -133,6 +139,7 @@ class Outgoing:
     time: int | None = None
     reach: Sequence[Way] = ()
     serves: bool = False
+    clocks: bytes = b""
 
 
 @dataclass(slots=True)
@@ -179,11 +186,11 @@ def write_message(out: Outgoing, entries: Sequence[Entry] = ()) -> bytes:
     samples: list[TransformStamped] = []
     for entry in entries:
         if isinstance(entry, OutgoingBatch):
-            samples += entry.samples
+            samples += entry.uncorrected()
     if len(samples) > MAX_SAMPLES:
         raise ValueError(f"a message of {len(samples)} samples, more than {MAX_SAMPLES}")
     try:
-        message = _head(out, entries) + (encode(samples) if samples else b"")
+        message = _head(out, entries) + (encode(samples) if samples else b"") + out.clocks
     except struct.error as error:
         raise ValueError(f"too much for one message: {error}") from None
     if len(message) > MAX_BYTES:
@@ -219,7 +226,7 @@ def sendable(entry: Entry, refuse: Callable[[str, Exception], object]) -> Entry 
             kept.append(sample)
         else:
             refuse(refused.reason, refused)
-    return OutgoingBatch(entry.origin, entry.sequence, kept) if kept else None
+    return replace(entry, samples=kept) if kept else None
 
 
 def can_hold(sample: TransformStamped) -> bool:
@@ -228,7 +235,7 @@ def can_hold(sample: TransformStamped) -> bool:
     # The same names come again with each sample of a frame.
     names = parent, child, authority
     if names in _HELD:
-        return _FIRST_STAMP <= stamp < _END_OF_STAMPS
+        return FIRST_STAMP <= stamp < END_OF_STAMPS
     if reason_not_to_send(sample) is not None:
         return False
     if len(_HELD) >= _MOST_HELD:
@@ -256,11 +263,12 @@ def reason_not_to_send(sample: TransformStamped) -> InvalidTransformError | None
 def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
     if len(entries) > MAX_ENTRIES:
         raise ValueError(f"too much for one message: {len(entries)} entries, more than {MAX_ENTRIES}")
-    origins: dict[bytes, int] = {}
+    origins: dict[tuple[bytes, int], int] = {}
     authorities: dict[str, int] = {}
     body = bytearray()
     for entry in entries:
-        origin = origins.setdefault(entry.origin, len(origins))
+        clock = _NO_CLOCK if isinstance(entry, RemovedFrame) or entry.clock is None else entry.clock
+        origin = origins.setdefault((entry.origin, clock), len(origins))
         if isinstance(entry, RemovedFrame):
             name = entry.frame.encode()
             if len(name) > MAX_NAME:
@@ -274,6 +282,7 @@ def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
         body += _ENTRY.pack(_BATCH, origin, len(tags), entry.sequence) + struct.pack(f"<{len(tags)}H", *tags)
     claim = out.claim
     flags = _FINAL * claim.final | _PARTIAL * claim.partial | _HAS_TIME * (out.time is not None) | _SERVES * out.serves
+    flags |= _HAS_CLOCKS * bool(out.clocks)
     counts = len(out.reach), len(origins), len(authorities), len(entries)
     held = claim.since, claim.sequence, claim.digest
     head = bytearray(_HEADER.pack(VERSION, out.kind, flags, *counts, out.number, out.bus, *held))
@@ -281,7 +290,8 @@ def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
         head += _TIME.pack(out.time)
     for bus, path in out.reach:
         head += bus + bytes((len(path),)) + b"".join(path)
-    head += b"".join(origins)
+    for named in origins:
+        head += _ORIGIN.pack(*named)
     for authority in authorities:
         text = authority.encode()
         head += _LENGTH.pack(len(text)) + text
@@ -297,6 +307,7 @@ class _Batch(NamedTuple):
     """A batch as the head of a message tells it; its tags are the authority of each sample and whether it is static."""
 
     origin: bytes
+    clock: int
     sequence: int
     tags: Sequence[tuple[str, bool]]
 
@@ -309,6 +320,11 @@ def kind_of(data: bytes) -> Kind | None:
         return Kind(data[1])
     except ValueError:
         return None
+
+
+def split_clocks(data: bytes) -> tuple[bytes, bytes]:
+    """A message without the section of clocks at its end, and the section; empty if it has none."""
+    return split_section(data) if len(data) > _HEADER.size and data[2] & _HAS_CLOCKS else (data, b"")
 
 
 def read_message(data: bytes) -> Iterator[Heard | Text | None]:
@@ -363,7 +379,8 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
         valid = [sample for sample in samples[place : place + len(entry.tags)] if sample is not None]
         place += len(entry.tags)
         size += 1 + len(entry.tags)
-        heard.entries.append(ReceivedBatch(entry.origin, entry.sequence, valid))
+        clock = None if entry.clock == _NO_CLOCK else entry.clock
+        heard.entries.append(ReceivedBatch(entry.origin, entry.sequence, valid, clock))
     yield heard
 
 
@@ -400,8 +417,8 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
         path = [data[at + 1 + _BUS * (k + 1) : at + 1 + _BUS * (k + 2)] for k in range(length)]
         reach.append((data[at : at + _BUS], tuple(path)))
         at += _BUS * (length + 1) + 1
-    origins = [data[at + _BUS * k : at + _BUS * (k + 1)] for k in range(origin_count)]
-    at += _BUS * origin_count
+    origins = [_ORIGIN.unpack_from(data, at + _ORIGIN.size * k) for k in range(origin_count)]
+    at += _ORIGIN.size * origin_count
     authorities = []
     for _ in range(authority_count):
         (length,) = _LENGTH.unpack_from(data, at)
@@ -418,7 +435,7 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
         entry_kind, origin, size, entry_number = _ENTRY.unpack_from(data, at)
         at += _ENTRY.size
         if entry_kind == _REMOVAL and size <= MAX_NAME:
-            entries.append(RemovedFrame(origins[origin], entry_number, data[at : at + size].decode()))
+            entries.append(RemovedFrame(origins[origin][0], entry_number, data[at : at + size].decode()))
             at += size
         elif entry_kind == _BATCH:
             count += size
@@ -427,7 +444,8 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
             tags = struct.unpack_from(f"<{size}H", data, at)
             at += 2 * size
             named = [(authorities[tag >> 1], bool(tag & 1)) for tag in tags]
-            entries.append(_Batch(origins[origin], entry_number, named))
+            named_origin, clock = origins[origin]
+            entries.append(_Batch(named_origin, clock, entry_number, named))
         else:
             raise IndexError
     # Slicing past the end raises nothing, so the end is checked.

@@ -34,11 +34,13 @@ from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import SeenKeys
 from tfbus.errors import UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.links.clocks import OwnClock
 from tfbus.links.message import can_hold, sendable
 from tfbus.links.replica import Entry, Known, OutgoingBatch, Provenance, ReceivedTransform, RemovedFrame, Replica, View
 from tfbus.links.seams import Host
 from tfbus.registration import Registration
 from tfbus.rows import Row
+from tfbus.stamps import format_duration, format_stamp
 
 LARGEST_JUMP = 2**52
 """A number may be so far ahead of this machine's time: 142 years in us, for some machines begin in 1970."""
@@ -69,10 +71,13 @@ class Outbox:
         The frames that the links of each robot bring by this link.
     own : View or None
         The view of them that this link tells; None if it tells no entries.
+    max_offset : float
+        Clocks that differ by so many ns at most are near enough.
     """
 
     host: Host
     own: View | None = None
+    max_offset: float = inf
 
     def __init__(self, frames: Iterable[str] | None) -> None:
         self.frames: frozenset[str] | None = None if frames is None else frozenset(frames)
@@ -111,6 +116,8 @@ class Peer:
         Whether it has announced that it is there.
     robot : str
         The robot whose link it is; empty without one.
+    is_placed : bool
+        Whether its clock has been measured, or cannot be.
     rate : float
         How often newest samples are wanted of it, in Hz; infinite for everything, 0 for nothing.
     thinned : float
@@ -134,6 +141,7 @@ class Peer:
     id: str
     present: bool = False
     robot: str = ""
+    is_placed: bool = False
     rate: float = inf
     thinned: float = -inf
     number: int = 0
@@ -159,10 +167,12 @@ class Relay:
     Attributes
     ----------
     replica : Replica
+    clock : OwnClock
     """
 
     def __init__(self, bus: Bus) -> None:
         self.replica: Replica = Replica()
+        self.clock: OwnClock = OwnClock(bus.clock)
         self._number = 0
         self._bus = bus
         self._registration: Registration | None = None
@@ -315,6 +325,29 @@ class Relay:
             if not self._bus.closed and known is not None and known.shown is not None and owns(known.shown):
                 self.remove(frame, None)
 
+    def begin_anew(self, origin: bytes) -> tuple[str, ...]:
+        """Forget the samples of the moving frames of a bus, on this bus alone; returns the frames, sorted."""
+        found = []
+        for frame in self.frames_of(lambda source: source.origin == origin):
+            known = self.replica.entries.get(frame)
+            if not self._bus.closed and known is not None and known.sample is not None and not known.sample.static:
+                self.remove(frame, None)
+                found.append(frame)
+        return tuple(found)
+
+    def clock_of(self, frame: str) -> str:
+        """The clock that stamps a frame beside this bus's, in words; empty if they agree, or that is not known."""
+        known = self.replica.entries.get(frame)
+        source = None if known is None else known.shown
+        own = self.clock.base()
+        if known is None or known.sample is None or source is None or source.clock is None or own is None:
+            return ""
+        ahead = source.clock - own
+        if not isinstance(source.outbox, Outbox) or abs(ahead) <= source.outbox.max_offset:
+            return ""
+        clock = f"its clock runs {format_duration(abs(ahead))} {'ahead of' if ahead > 0 else 'behind'} this one"
+        return f"{clock}, and stamped {format_stamp(known.sample.stamp - source.shift)}" if source.shift else clock
+
     # Inside
 
     def _on_batch(self, batch: Batch) -> None:
@@ -334,7 +367,7 @@ class Relay:
         entries = self.replica.entries
         for source, group in groupby(batch, source_of):
             if source is None:
-                source = Provenance(self.replica.origin, self.next_number())
+                source = Provenance(self.replica.origin, self.next_number(), clock=self.clock.base())
             samples = tuple(group)
             for sample in samples:
                 child = sample._fields[1]
@@ -350,7 +383,7 @@ class Relay:
                 shown = known.shown
                 if shown is None or shown.sequence < source.sequence or shown.rank < source.rank:
                     known.shown = source
-            outgoing = OutgoingBatch(source.origin, source.sequence, samples)
+            outgoing = OutgoingBatch(source.origin, source.sequence, samples, source.clock, source.shift)
             for outbox in outboxes:
                 outbox.add(outgoing, echo=outbox is source.outbox)
 
@@ -392,7 +425,8 @@ class Relay:
 def relay_of(bus: Bus) -> Relay:
     """The relay of a bus, which its links share; the bus itself holds it."""
     if not isinstance(bus._relay, Relay):
-        bus._relay = Relay(bus)
+        relay = bus._relay = Relay(bus)
+        bus._clock_of = relay.clock_of
     return bus._relay
 
 

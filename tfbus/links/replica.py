@@ -82,7 +82,7 @@ try:
 except ImportError:  # A Python that has it elsewhere.
     from hashlib import blake2b
 
-from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.stamped import TransformStamped, shifted
 from tfbus.rows import Row
 
 SETTLING = 1.5
@@ -125,11 +125,17 @@ class OutgoingBatch:
     sequence : int
         The batch's number on that bus.
     samples : sequence of TransformStamped
+    clock : int or None
+        The base of the clock that stamped them, against this machine's steady clock, in ns: see `tfbus.links.clocks`.
+    shift : int
+        The ns by which the stamps of its moving samples were corrected.
     """
 
     origin: bytes
     sequence: int
     samples: Sequence[TransformStamped]
+    clock: int | None = None
+    shift: int = 0
 
     @property
     def size(self) -> int:
@@ -141,7 +147,11 @@ class OutgoingBatch:
         if frames is None:
             return self
         samples = tuple(sample for sample in self.samples if sample._fields[1] in frames)
-        return OutgoingBatch(self.origin, self.sequence, samples) if samples else None
+        return OutgoingBatch(self.origin, self.sequence, samples, self.clock, self.shift) if samples else None
+
+    def uncorrected(self) -> Sequence[TransformStamped]:
+        """Its samples with the stamps that their sender gave them."""
+        return [shifted(sample, -self.shift) for sample in self.samples] if self.shift else self.samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,12 +185,21 @@ class Provenance:
         The link that brought it, which does not send it back. None for this bus's own.
     peer : Peer or None
         The other end of that link; None for this bus's own.
+    told : int or None
+        The base of the clock that stamped its samples, as the peer has told it.
+    clock : int or None
+        The same, as in `OutgoingBatch`; None if it is not known.
+    shift : int
+        The ns by which the stamps of its moving samples were corrected.
     """
 
     origin: bytes
     sequence: int
     outbox: object | None = None
     peer: object | None = None
+    told: int | None = None
+    clock: int | None = None
+    shift: int = 0
 
     @property
     def rank(self) -> Rank:
@@ -193,6 +212,12 @@ class ReceivedTransform(TransformStamped):
 
     __slots__ = ("_provenance",)
     _provenance: Provenance
+
+    def again(self) -> "ReceivedTransform":
+        """The same once more, so that its fields may change."""
+        again = ReceivedTransform.__new__(ReceivedTransform)
+        again._fields, again._provenance = self._fields, self._provenance
+        return again
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy in another process has not come over this link.
@@ -256,7 +281,8 @@ class Known:
         """As it goes into a message."""
         if self.sample is None:
             return RemovedFrame(self.source.origin, self.source.sequence, self.frame)
-        return OutgoingBatch(self.source.origin, self.source.sequence, (self.sample,))
+        source = self.source
+        return OutgoingBatch(source.origin, source.sequence, (self.sample,), source.clock, source.shift)
 
 
 class Claim(NamedTuple):
@@ -430,8 +456,9 @@ class Replica:
     def _replaces(source: Provenance, sample: TransformStamped | None, known: Known) -> bool:
         if source.sequence != known.source.sequence or source.origin != known.source.origin:
             return source.rank > known.source.rank
-        # Two samples of one batch.
-        return sample is not None and known.sample is not None and sample.stamp > known.sample.stamp
+        # Two samples of one batch, by the stamps that its sender gave them.
+        shift = source.shift - known.source.shift
+        return sample is not None and known.sample is not None and sample.stamp - shift > known.sample.stamp
 
     def _admit(self, origin: bytes, known: Known | None, sample: TransformStamped | None, max_frames: float) -> None:
         """Count a new entry in place of a known one."""

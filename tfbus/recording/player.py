@@ -20,8 +20,9 @@ from tfbus._aio.turn_budget import TurnBudget
 from tfbus.bus.bus import Bus
 from tfbus.clock import SimulatedClock
 from tfbus.errors import UnknownFrameError
+from tfbus.geometry.stamped import shifted
 from tfbus.recording.recording import OdometryTopics, RecordedMessage, Recording, Selection, Topics, open_recording
-from tfbus.stamps import SECOND, as_stamp, from_seconds, is_real, to_seconds
+from tfbus.stamps import SECOND, as_offset, as_stamp, from_seconds, is_real, to_seconds
 
 _BLOCK = 256
 
@@ -135,6 +136,8 @@ class Player:
         The first and the last log time, in ns. The static transforms from before are played first.
     topics, prefix, namespaces, odometry, invert
         As `open_recording`.
+    offset : float
+        Added to each stamp of a moving sample, in s; the pace and the log times stay.
 
     Attributes
     ----------
@@ -182,6 +185,7 @@ class Player:
         namespaces: bool = False,
         odometry: OdometryTopics = None,
         invert: bool = False,
+        offset: float = 0.0,
     ) -> None:
         # Wrong topics raise here, and not in `play`.
         Selection(topics, prefix, namespaces, odometry, invert)
@@ -192,6 +196,7 @@ class Player:
             "odometry": odometry,
             "invert": invert,
         }
+        self._offset = as_offset(offset)
         _check_rate(rate)
         self._since = None if since is None else as_stamp(since)
         self._until = None if until is None else as_stamp(until)
@@ -506,6 +511,8 @@ class Player:
             self.bad.update(error.reason for error in errors)
         if not batch:
             return
+        if self._offset:
+            batch = tuple(shifted(sample, self._offset) for sample in batch)
         self.bus.publish(batch, "drop")
         self.played += len(batch)
         if self._simulated is None:

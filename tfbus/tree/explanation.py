@@ -51,6 +51,8 @@ class ExplainedEdge(PlainData):
     shares : tuple of 6 floats
         The part of the variance of each number of the answer's error that comes from this edge, in the order of
         `Covariance`; empty if the edge gave no covariance.
+    clock : str
+        The clock of the sender beside the clock of the bus, in words, if a link knows that they differ; else empty.
 
     Examples
     --------
@@ -73,6 +75,7 @@ class ExplainedEdge(PlainData):
     authority: str = ""
     error: ExtrapolationError | None = None
     shares: tuple[float, ...] = ()
+    clock: str = ""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -197,7 +200,7 @@ def _cells(edge: ExplainedEdge, now: int | None, below: bool) -> list[str]:
         format_rate(edge.static, edge.newest, edge.rate),
         age,
         _samples(edge),
-        f"from {edge.authority!r}" if edge.authority else "",
+        "; ".join(filter(None, (f"from {edge.authority!r}" if edge.authority else "", edge.clock))),
     ]
 
 

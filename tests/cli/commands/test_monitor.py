@@ -5,8 +5,9 @@ import pytest
 from support.commands import Command
 from support.samples import moving, static
 
-from tfbus import SECOND, Bus
-from tfbus.cli.commands.monitor import Chain, text_lines
+from tfbus import SECOND, Bus, PeerClock
+from tfbus.analysis import Arrivals
+from tfbus.cli.commands.monitor import Chain, text_lines, to_document
 
 
 async def publish(bus: Bus) -> None:
@@ -23,9 +24,9 @@ def test_each_frame_and_sender_is_a_line(tfbus: Command) -> None:
     done = tfbus.on_domain(publish, "monitor", "--once", "--duration", "3.04")
     assert (done.returncode, done.stderr) == (0, "")
     titles, arm, base, camera = done.stdout.splitlines()
-    head = ["frame", "sender", "rate", "delay mean", "p99", "max", "jitter", "longest gap", "late", "lost"]
+    head = ["frame", "sender", "rate", "delay least", "mean", "p99", "max", "jitter", "longest gap", "late", "lost"]
     assert re.split("  +", titles) == head
-    assert arm.split() == "arm joints 10.0 Hz 20 ms 20 ms 20 ms 0 ns 100 ms 0 0".split()  # noqa: SIM905 - as printed
+    assert arm.split() == "arm joints 10.0 Hz 20 ms 20 ms 20 ms 20 ms 0 ns 100 ms 0 0".split()  # noqa: SIM905 - as printed
     assert base.split()[:4] == ["base", "odometry", "2.0", "Hz"]
     assert camera.split() == ["camera", "urdf", "static"]
 
@@ -61,6 +62,27 @@ def test_it_is_printed_again_and_again_as_json_too(tfbus: Command) -> None:
     ]
     done = tfbus.on_domain(publish_for_a_while, "monitor", "--rate", "1")
     assert done.stdout.count("frame ") == 3
+
+
+def test_peers_and_senders_whose_clocks_differ_have_tables() -> None:
+    arrivals = Arrivals(10.0)
+    for authority, ahead in (("odometry", 300), ("slam", 300), ("simulation", -(10**12)), ("good", -5)):
+        arrivals.note((moving("map", f"by {authority}", ahead * 10**6, authority=authority),), 0)
+    clocks = [PeerClock("7d4f" * 8, ("odometry",), 0.31, 0.0002, 1.5e-6, 0.0004), PeerClock("ab" * 16, runs=False)]
+    lines = list(text_lines(arrivals.measure(0), None, None, clocks))
+    blank = lines.index("")
+    assert [re.split("  +", line) for line in lines[blank + 1 :]] == [
+        ["peer", "senders", "clock ahead by", "within", "drift", "round trip"],
+        ["7d4f7d4f", "odometry", "310 ms", "200 us", "1.5 us/s", "400 us"],
+        ["abababab", "simulated"],
+        [""],
+        ["sender", "least delay", "its clock"],
+        ["simulation", "31.7 years", "another clock (simulated?)"],
+        ["slam", "-300 ms", "its clock is at least 300 ms ahead of this one"],
+    ]
+    document = to_document(arrivals.measure(0), None, 10.0, clocks)
+    assert [clock["offset"] for clock in document["clocks"]] == [0.31, None]
+    assert {one["authority"]: one["delay"] for one in document["senders"]}["good"] == 0.005
 
 
 def test_the_way_between_two_frames_is_folded_and_indented_on_a_narrow_terminal() -> None:

@@ -98,6 +98,11 @@ def test_a_part_is_given_in_seconds_from_the_beginning(
     assert [sample.child for sample in received if sample.static] == ["rig"]
 
 
+def test_an_offset_is_added_to_the_stamps(tfbus: Command, ten_seconds: Path) -> None:
+    _, received = play(tfbus, ten_seconds, "--rate", "inf", "--to", "0", "--offset", "-0.5")
+    assert [sample.stamp - START for sample in received if not sample.static] == [-SECOND // 2]
+
+
 def test_an_empty_recording_plays_nothing(tfbus: Command, tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "empty.mcap", [])
     done, received = play(tfbus, path, "--from", "1", "--to", "2")

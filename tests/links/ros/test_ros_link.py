@@ -35,6 +35,24 @@ async def test_a_link_to_ros_passes_on_both_ways_what_its_options_let_through() 
     assert carrier.closed
 
 
+async def test_an_offset_moves_stamps_on_their_way_in_and_back_on_their_way_out() -> None:
+    states: list[object] = []
+    options: RosOptions = {"offset": 2.0, "joint_states": lambda *state: states.append(state[1])}
+    carrier = ListCarrier(options)
+    heard: list[object] = []
+    with Bus(max_ahead=None) as bus:
+        async with RosLink(bus, "ros", carrier, **options) as link:
+            bus.publish([moving("map", "base", from_seconds(5.0)), moving("map", "early", from_seconds(-(2.0**31)))])
+            bus.subscribe(heard.append)
+            carrier.hear(RosMessage(encode([moving("map", "arm", from_seconds(9.0))]), static=False, authority="/n"))
+            carrier.hear(RosMessage(joint_state(from_seconds(3.0), {"hip": 0.5}), False, "/n", joints=True))
+            await until(lambda: link.statistics().received_messages == 2)
+            assert link.statistics().not_sent == {"stamp": 1}
+    assert carrier.said == [(False, [("map", "base", from_seconds(3.0))])]
+    assert heard == [(moving("map", "arm", from_seconds(11.0), authority="/n"),)]
+    assert states == [from_seconds(5.0)]
+
+
 @pytest.mark.parametrize(("options", "frames"), [({}, 1), ({"drop_lost": False}, 1), ({"drop_lost": True}, 0)])
 async def test_the_frames_of_a_lost_peer_stay_or_are_dropped_and_come_back_as_they_were(
     options: RosOptions, frames: int

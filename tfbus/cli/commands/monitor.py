@@ -14,20 +14,32 @@ from tfbus.cli.output import Column, format_span, print_now, table_lines, termin
 with lazy_imports():
     from rich.text import Text
 
-    from tfbus.analysis.arrivals import Arrival, Arrivals
+    from tfbus.analysis.arrivals import Arrival, Arrivals, sender_delays
     from tfbus.buffer.buffer import Buffer
     from tfbus.bus.bus import Bus
     from tfbus.cli.tree_display import TreeDisplay
     from tfbus.errors import TransformLookupError
+    from tfbus.links.link import Link
     from tfbus.stamps import from_seconds
+    from tfbus.statistics import PeerClock
     from tfbus.tree.tree import TransformTree
 
+_CLOCK_COLUMNS = (
+    Column("peer"),
+    Column("senders", importance=1),
+    Column("clock ahead by", right=True),
+    Column("within", right=True, importance=4),
+    Column("drift", right=True, importance=3),
+    Column("round trip", right=True, importance=2),
+)
+_DELAY_COLUMNS = Column("sender"), Column("least delay", right=True), Column("its clock")
 # The least important column has the lowest number.
 _COLUMNS = (
     Column("frame"),
     Column("sender", importance=1),
     Column("rate", right=True),
-    Column("delay mean", right=True, importance=9),
+    Column("delay least", right=True, importance=2),
+    Column("mean", right=True, importance=9),
     Column("p99", right=True, importance=7),
     Column("max", right=True, importance=8),
     Column("jitter", right=True, importance=3),
@@ -76,7 +88,8 @@ def monitor(
     A delay is the time from the stamp of a sample to its arrival here; jitter is the standard deviation of the time
     between two arrivals. A late sample has an older stamp than an earlier sample. Lost samples are counted by the gaps
     between stamps, if the sender has a fixed rate. With TARGET and SOURCE, only the frames between the two are shown,
-    and the slowest of them.
+    and the slowest of them. A table of peers follows: how far the clock of each is ahead of this one, the bound of
+    that, its drift, and the round trip; and for senders without a measured clock, what their smallest delays tell.
 
     Example: tfbus monitor map base_link
 
@@ -103,6 +116,8 @@ def monitor(
             raise UsageError(f"a pair is TARGET and SOURCE, and {target!r} has no SOURCE")
         pair = (target, source)
 
+    links: list[Link] = []
+
     async def measure(bus: Bus) -> None:
         arrivals = Arrivals(window)
         with (
@@ -117,11 +132,13 @@ def monitor(
                 chain = None if pair is None else chain_of(buffer.tree, *pair, found, now)
                 if chain is not None and chain.frames:
                     found = [arrival for arrival in found if arrival.frame in chain.frames]
+                clocks = [clock for each in links for clock in each.statistics().clocks]
                 if as_json:
-                    document = to_document(found, chain, window)
+                    document = to_document(found, chain, window, clocks)
                     print_now(json.dumps(document, indent=2 if once else None))
                 else:
-                    display.show_lines([Text(line) for line in text_lines(found, chain, terminal_width())])
+                    lines = text_lines(found, chain, terminal_width(), clocks)
+                    display.show_lines([Text(line) for line in lines])
 
             await link.first_transform(bus)
             if once:
@@ -131,7 +148,7 @@ def monitor(
             async for _ in bus.clock.ticks(rate):
                 show()
 
-    link.run(measure)
+    link.run(measure, links=links)
 
 
 def chain_of(tree: TransformTree, target: str, source: str, arrivals: Sequence[Arrival], now: int) -> Chain:
@@ -148,13 +165,18 @@ def chain_of(tree: TransformTree, target: str, source: str, arrivals: Sequence[A
     return Chain(frames, slowest, None if newest is None else (now - newest) / from_seconds(1), "")
 
 
-def to_document(arrivals: Sequence[Arrival], chain: Chain | None, window: float) -> dict[str, Any]:
+def to_document(
+    arrivals: Sequence[Arrival], chain: Chain | None, window: float, clocks: Sequence[PeerClock]
+) -> dict[str, Any]:
     """The JSON object of one update."""
     pair = {} if chain is None else {"chain": asdict(chain)}
-    return {"window": window, "frames": [asdict(arrival) for arrival in arrivals], **pair}
+    frames, senders = [asdict(arrival) for arrival in arrivals], [asdict(one) for one in sender_delays(arrivals)]
+    return {"window": window, "frames": frames, **pair, "clocks": [asdict(one) for one in clocks], "senders": senders}
 
 
-def text_lines(arrivals: Sequence[Arrival], chain: Chain | None, width: int | None) -> Iterator[str]:
+def text_lines(
+    arrivals: Sequence[Arrival], chain: Chain | None, width: int | None, clocks: Sequence[PeerClock] = ()
+) -> Iterator[str]:
     """The lines of one update, which fit the width."""
     if chain is not None:
         yield from wrapped(_describe(chain), width, 2)
@@ -163,6 +185,15 @@ def text_lines(arrivals: Sequence[Arrival], chain: Chain | None, width: int | No
         yield "(no frames)"
         return
     yield from table_lines(_COLUMNS, [_row(arrival) for arrival in arrivals], width)
+    if any(clock.offset is not None for clock in clocks):
+        yield ""
+        yield from table_lines(_CLOCK_COLUMNS, [_clock_row(clock) for clock in clocks], width)
+    measured = {authority for clock in clocks if clock.offset is not None for authority in clock.authorities}
+    delays = [one for one in sender_delays(arrivals) if one.remark and one.authority not in measured]
+    if delays:
+        yield ""
+        rows = [(one.authority, format_span(one.delay), one.remark) for one in delays]
+        yield from table_lines(_DELAY_COLUMNS, rows, width)
 
 
 def _describe(chain: Chain) -> str:
@@ -174,6 +205,18 @@ def _describe(chain: Chain) -> str:
     return f"{path}: {age}{slowest}"
 
 
+def _clock_row(clock: PeerClock) -> tuple[str, ...]:
+    unknown = "not yet measured" if clock.runs else "simulated"
+    return (
+        clock.peer[:8],
+        ", ".join(clock.authorities),
+        unknown if clock.offset is None else format_span(clock.offset),
+        format_span(clock.bound),
+        "" if clock.drift is None else f"{clock.drift * 1e6:.1f} us/s",
+        format_span(clock.delay),
+    )
+
+
 def _row(arrival: Arrival) -> tuple[str, ...]:
     rate = "" if arrival.rate is None else f"{arrival.rate:.1f} Hz"
     state = "static" if arrival.static else "silent" if not arrival.samples else rate or "one sample"
@@ -182,6 +225,7 @@ def _row(arrival: Arrival) -> tuple[str, ...]:
         arrival.frame,
         arrival.authority,
         state,
+        format_span(arrival.delay_min),
         format_span(arrival.delay_mean),
         format_span(arrival.delay_p99),
         format_span(arrival.delay_max),

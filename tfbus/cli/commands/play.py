@@ -52,6 +52,7 @@ def play(
     since: Annotated[Instant | None, Parameter(name="--from")] = None,
     until: Annotated[Instant | None, Parameter(name="--to")] = None,
     clock: Flag = False,
+    offset: float = 0.0,
     topics: TopicOptions = DEFAULT_TOPICS,
     link: LinkOptions = DEFAULT_LINK,
 ) -> int:
@@ -76,13 +77,15 @@ def play(
         The end, in the same ways.
     clock
         Publish the time of the recording as well; echo, tree and listen follow it, and count ages by it.
+    offset
+        Seconds that are added to each stamp of a moving frame.
     """
     start, end = _log_times(file, topics, since, until)
 
     async def play_to_domain(bus: Bus) -> int:
         # The status of a termination, which cancels the tasks before the player has ended.
         status = ENDED_BY_SIGNAL + signal.SIGTERM
-        player = Player(bus, file, rate=rate, loop=loop, since=start, until=end, **topics.arguments())
+        player = Player(bus, file, rate=rate, loop=loop, since=start, until=end, offset=offset, **topics.arguments())
         await _wait_for_peer(bus)
         say(f"playing {file} on {link.place}")
         began = time.monotonic()

@@ -27,7 +27,7 @@ class LocalLink(DomainLink):
         are none, as on Windows; all links of a domain have to use the same.
     **options
         The options of `tfbus.links.DomainLink`: `robot`, `robots`, `slow_rate`, `frames`, `drop_lost`, `max_frames`,
-        `capacity`, `history`, `clock` and `tell_clock`.
+        `capacity`, `history`, `max_offset`, `correct_clocks`, `clock` and `tell_clock`.
 
     Raises
     ------

@@ -211,7 +211,8 @@ class ForeignEnd(Endpoint):
 
     def _source(self, peer: Peer) -> Provenance:
         """The source of the next batch of this world: it has the name and the next number of this bus."""
-        return Provenance(self.relay.replica.origin, self.relay.next_number(), self, peer)
+        relay = self.relay
+        return Provenance(relay.replica.origin, relay.next_number(), self, peer, clock=relay.clock.base())
 
     def _take(self, sender: str, content: Any) -> None:
         message = self._carrier.read(content)

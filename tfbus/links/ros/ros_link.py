@@ -136,7 +136,7 @@ class RosCarrier(Carrier, ABC):
         if content.joints:
             stamp, positions = self._decode_joints(content.payload)
             if self.settings.joint_states is not None:
-                self.settings.joint_states(positions, stamp)
+                self.settings.joint_states(positions, stamp + self.settings.names.offset)
             return ReceivedMessage([])
         if content.description:
             description = decode_text(content.payload)
@@ -273,6 +273,9 @@ class RosLink(Link):
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
         How many messages of moving frames may wait for the event loop; then the oldest are dropped and counted.
+    offset : float
+        Added to each stamp that comes from ROS, in s, and taken off each that goes there, such as ``-0.3`` for a robot
+        whose clock is 0.3 s ahead. All links of a bus to one system of ROS need the same.
 
     Raises
     ------

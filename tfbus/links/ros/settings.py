@@ -1,7 +1,8 @@
 """The settings that all links to ROS share: topics, names of frames, and who takes joints, a description, the time.
 
 `RosOptions` are the arguments of a link, as a user writes them; `settings_of` checks them and makes the `RosSettings`
-that a carrier reads. `FrameNames` puts the prefix of a robot in front of its frames and takes it off again.
+that a carrier reads. `FrameNames` puts the prefix of a robot in front of its frames and moves stamps by an offset, and
+undoes both.
 """
 
 import os
@@ -13,8 +14,10 @@ from typing import TypedDict
 from tfbus.clock import SimulatedClock
 from tfbus.errors import InvalidTransformError
 from tfbus.frames import Prefix, as_prefix
-from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.stamped import TransformStamped, shifted
 from tfbus.links.endpoint import HearsTime
+from tfbus.stamps import as_offset
+from tfbus.tf_message import refusal
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
@@ -51,10 +54,13 @@ class FrameNames:
         In front of each name on the bus, and of none in ROS.
     shared : iterable of str
         Names without it.
+    offset : float
+        How far stamps on the bus are ahead of those in ROS, in s.
     """
 
-    def __init__(self, prefix: str | None = None, shared: Iterable[str] = ()) -> None:
+    def __init__(self, prefix: str | None = None, shared: Iterable[str] = (), offset: float = 0.0) -> None:
         self._prefix: Prefix | None = as_prefix(prefix, shared)
+        self.offset: int = as_offset(offset)
 
     def put_on_bus(self, sample: TransformStamped) -> None:
         """Give a sample that nobody else has yet the names on the bus.
@@ -64,6 +70,8 @@ class FrameNames:
         InvalidTransformError
             With the reason ``"prefix"``, for a name that has the prefix in ROS too: another link has brought it there.
         """
+        if self.offset:
+            sample._fields = shifted(sample, self.offset)._fields
         if self._prefix is None:
             return
         parent, child, stamp, row, authority, static = sample._fields
@@ -88,8 +96,12 @@ class FrameNames:
         Raises
         ------
         InvalidTransformError
-            With the reason ``"prefix"``, if the parent has no name there.
+            With the reason ``"prefix"``, if the parent has no name there; or if the stamp fits no message.
         """
+        if self.offset:
+            sample = shifted(sample, -self.offset)
+            if (error := refusal(sample)) is not None:
+                raise error
         if self._prefix is None:
             return sample
         parent, child, stamp, row, authority, static = sample._fields
@@ -136,6 +148,7 @@ class RosOptions(TypedDict, total=False):
     drop_lost: bool
     max_frames: int
     capacity: int
+    offset: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +208,7 @@ def settings_of(options: RosOptions) -> RosSettings:
     return RosSettings(
         as_topics(options.get("tf", "/tf"), "tf"),
         as_topics(options.get("tf_static", "/tf_static"), "tf_static"),
-        FrameNames(options.get("prefix"), options.get("shared", ())),
+        FrameNames(options.get("prefix"), options.get("shared", ()), options.get("offset", 0.0)),
         bool(options.get("send", True)),
         authority,
         joint_states,

@@ -32,7 +32,7 @@ class ZenohLink(DomainLink):
         once.
     **options
         The options of `tfbus.links.DomainLink`: `robot`, `robots`, `slow_rate`, `frames`, `drop_lost`, `max_frames`,
-        `capacity`, `history`, `clock` and `tell_clock`.
+        `capacity`, `history`, `max_offset`, `correct_clocks`, `clock` and `tell_clock`.
 
     Raises
     ------
