@@ -18,7 +18,7 @@ from cyclopts import Group, Parameter
 
 from tfbus.cli.arguments import Backend, UsageError, usage_errors
 from tfbus.cli.lazy_imports import lazy_imports
-from tfbus.cli.output import say, warn
+from tfbus.cli.output import print_now, say, warn
 
 with lazy_imports():
     import anyio
@@ -29,6 +29,7 @@ with lazy_imports():
     from tfbus.clock import Clock, SimulatedClock
     from tfbus.errors import InvalidTransformError, pip_install
     from tfbus.geometry.stamped import TransformStamped
+    from tfbus.links.bus_server import BusServer
     from tfbus.links.link import DomainLink, DomainOptions, Link
     from tfbus.links.local import LocalLink
 
@@ -159,6 +160,31 @@ class LinkOptions:
                     return await program(bus)
 
         return run(join_and_run, self.backend)
+
+    def serve(self, server_of: Callable[[Bus], BusServer], hint: str) -> None:
+        """Run a server of the joined bus until Ctrl-C; its address is printed, and the hint, which may have a {place}.
+
+        Raises
+        ------
+        UsageError
+            If the server cannot be made, or cannot listen at its address.
+        """
+
+        async def serve(bus: Bus) -> None:
+            with usage_errors():
+                server = server_of(bus)
+            try:
+                await server.__aenter__()
+            except OSError as error:
+                raise UsageError(str(error)) from None
+            try:
+                print_now(server.address)
+                say(hint.format(place=server.address.removeprefix("ws://")))
+                await anyio.sleep_forever()
+            finally:
+                await server.__aexit__(None, None, None)
+
+        self.run(serve)
 
     @asynccontextmanager
     async def join(self, bus: Bus) -> AsyncIterator[Sequence[Link]]:

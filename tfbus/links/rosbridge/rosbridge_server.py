@@ -36,6 +36,7 @@ from tfbus._aio.websocket import WebSocket
 from tfbus.buffer.buffer import Buffer
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
+from tfbus.bus.queues import Stream
 from tfbus.errors import BusClosedError, ClockResetError, TransformLookupError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.bus_server import BusServer
@@ -90,6 +91,9 @@ class RosbridgeServer(BusServer):
     bus : Bus
     port : int
         The port to listen at; 0 for any.
+    buffer : Buffer, optional
+        The buffer of the bus that answers the clients of tf. By default, it is one of the server's own, which knows of
+        static frames, and of what moves from then on.
     host : str
         The address to listen at; by default, only programs on this machine can connect.
     origins : iterable of str
@@ -117,7 +121,7 @@ class RosbridgeServer(BusServer):
     Raises
     ------
     ValueError
-        If the port is out of range, or an origin has not the form of one.
+        If the port is out of range, an origin has not the form of one, or the buffer belongs to another bus.
     OSError
         On entering, if the address cannot be listened at.
     BusClosedError, RuntimeError
@@ -138,27 +142,38 @@ class RosbridgeServer(BusServer):
         bus: Bus,
         port: int = 9090,
         *,
+        buffer: Buffer | None = None,
         host: str = "127.0.0.1",
         origins: Iterable[str] = (),
         publish: bool = False,
         page: str | None = None,
     ) -> None:
+        if buffer is not None and buffer.bus is not bus:
+            raise ValueError("the buffer belongs to another bus")
         text = "this is a rosbridge: connect with roslib\n" if page is None else page
         file = WebFile(f"text/{'plain' if page is None else 'html'}; charset=utf-8", text.encode())
         # A page of the user loads what it wants; only pages of other servers may not hide it in theirs.
         site = WebSite({"/": file}, self._talk, MAX_REQUEST, policy="frame-ancestors 'self'")
         super().__init__(bus, host, port, origins, site.answer)
-        self.may_publish: bool = publish
+        self._may_publish: bool = publish
         self.sent: int = 0
-        self.dropped: int = 0
+        self._streams: set[Stream] = set()
+        self._dropped: int = 0
         self.requests_refused: int = 0
-        self.buffer: Buffer
+        self._given = buffer
+        self._buffer: Buffer
+
+    @property
+    def dropped(self) -> int:
+        """Samples that were not sent, because a page was too slow."""
+        return self._dropped + sum(stream.dropped for stream in self._streams)
 
     async def _open(self) -> None:
-        self.buffer = Buffer(self.bus)
+        self._buffer = Buffer(self.bus) if self._given is None else self._given
 
     async def _close(self) -> None:
-        self.buffer.close()
+        if self._given is None:
+            self._buffer.close()
 
     async def _talk(self, socket: WebSocket) -> None:
         await _Page(self, socket).run()
@@ -222,6 +237,8 @@ class _Page:
         self._named: dict[str, _Republication] = {}
         self._names = count()
         self._published: set[str] = set()
+        # A page whose connection broke may send its goal before it subscribes to the feedback.
+        self._hears_feedback = anyio.Event()
         # Work by its topic, or by the name of its goal, and the number of frames that it republishes.
         self._scopes: dict[str, tuple[anyio.CancelScope, int]] = {}
         self._out, self._outgoing = anyio.create_memory_object_stream[str | bytes](0)
@@ -349,9 +366,11 @@ class _Page:
 
     def _follow(self, topic: str) -> None:
         """Begin to send a topic as all its subscriptions together want it, with all that is latched."""
-        if topic in _TOPICS:
+        if topic == _FEEDBACK:
+            self._hears_feedback.set()
+        elif topic in _TOPICS:
             self._start(topic, 0, lambda: self._send_topic(topic))
-        elif topic in self._named:
+        else:
             self._begin(topic, self._named[topic], lambda transforms: self._send_transforms(topic, transforms))
 
     async def _advertise(self, request: dict[str, Any]) -> None:
@@ -361,7 +380,7 @@ class _Page:
         _topic(request)
 
     def _check_published(self, topic: str) -> None:
-        if topic in _TOPICS and not self._server.may_publish:
+        if topic in _TOPICS and not self._server._may_publish:
             raise _RefusedRequest(f"this server takes nothing on {topic}: it was made without publish=True")
         if topic not in (*_TOPICS, _GOAL, _CANCEL):
             raise _RefusedRequest(f"nobody hears the topic {topic!r}; there are {', '.join(_TOPICS)}, {_GOAL}")
@@ -383,6 +402,7 @@ class _Page:
             async def say(transforms: Sequence[TransformStamped]) -> None:
                 header = {"stamp": _stamp(self._server.bus.clock.now()), "frame_id": ""}
                 feedback = {"header": header, "status": status, "feedback": _message(transforms)}
+                await self._hears_feedback.wait()
                 await self._send_message(_FEEDBACK, feedback, transforms)
 
             self._begin(_goal_of(id_), _republication_of(fields.get("goal"), "goal"), say)
@@ -420,7 +440,7 @@ class _Page:
         """Whether the bus has this very sample: it would go round for ever between two buses that are linked twice."""
         at = LATEST if sample.static else sample.stamp
         try:
-            held = self._server.buffer.lookup_nowait(sample.parent, sample.child, at)
+            held = self._server._buffer.lookup_nowait(sample.parent, sample.child, at)
         except TransformLookupError:
             return False
         return held.static == sample.static and held.transform == sample.transform
@@ -484,17 +504,20 @@ class _Page:
     async def _send_topic(self, topic: str) -> None:
         wishes = self._wishes[topic].values()
         period, length = min(wish.period for wish in wishes), min(wish.length for wish in wishes)
-        bus, static, seen = self._server.bus, _TOPICS[topic], 0
+        server, static = self._server, _TOPICS[topic]
         newest_only = period > 0.0 and not length
         capacity = MOST_CONFLATED if newest_only else min(length or MOST_WAITING, MOST_WAITING)
-        with bus.stream(capacity, "conflate" if newest_only else "drop_oldest") as batches:
-            async for batch in batches:
-                self._server.dropped += batches.dropped - seen
-                seen = batches.dropped
-                samples = [sample for sample in batch if sample.static is static]
-                if samples:
-                    await self._say_all(samples, lambda part: self._send_transforms(topic, part))
-                    await anyio.sleep(period)
+        with server.bus.stream(capacity, "conflate" if newest_only else "drop_oldest") as batches:
+            server._streams.add(batches)
+            try:
+                async for batch in batches:
+                    samples = [sample for sample in batch if sample.static is static]
+                    if samples:
+                        await self._say_all(samples, lambda part: self._send_transforms(topic, part))
+                        await anyio.sleep(period)
+            finally:
+                server._streams.discard(batches)
+                server._dropped += batches.dropped
 
     def _begin(self, key: str, republication: _Republication, say: Say) -> None:
         self._start(key, len(republication.sources), lambda: self._republish(republication, say))
@@ -515,7 +538,7 @@ class _Page:
 
         target, sources, min_translation, min_rotation, period = republication
         watch_of = partial(
-            self._server.buffer.watch, target, min_translation=min_translation, min_rotation=min_rotation
+            self._server._buffer.watch, target, min_translation=min_translation, min_rotation=min_rotation
         )
         with ExitStack() as watches:
             async with anyio.create_task_group() as tasks:
