@@ -62,4 +62,4 @@ async def main(port: int = 9090) -> None:
 
 
 if __name__ == "__main__":
-    anyio.run(main, *map(int, sys.argv[1:]))
+    anyio.run(main, int(sys.argv[1]) if sys.argv[1:] else 9090)

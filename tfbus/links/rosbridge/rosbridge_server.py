@@ -98,7 +98,7 @@ class RosbridgeServer(BusServer):
         The address to listen at; by default, only programs on this machine can connect.
     origins : iterable of str
         The web pages of other servers that may connect, such as ``http://localhost:8000``; ``*`` is for all. By default
-        only `page` may. A program that is no browser sends no origin, and may connect.
+        only its own page may. A program that is no browser sends no origin, and may connect.
     publish : bool
         Whether pages may publish on ``/tf`` and ``/tf_static``, with the authority ``"rosbridge"``.
     page : str, optional
