@@ -16,7 +16,7 @@ from typing import Annotated, Any, Protocol, TypeVar
 
 from cyclopts import Group, Parameter
 
-from tfbus.cli.arguments import Backend, UsageError, usage_errors
+from tfbus.cli.arguments import Backend, Flag, UsageError, usage_errors
 from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import print_now, say, warn
 
@@ -111,6 +111,9 @@ class LinkOptions:
     tf: tuple[str, ...] = ()
     tf_prefix: str | None = None
     backend: Backend = "asyncio"
+    # Those of `HearingOptions`, or of the command itself.
+    odometry: Annotated[tuple[str, ...], Parameter(parse=False)] = ()
+    invert: Annotated[Flag, Parameter(parse=False)] = False
 
     @property
     def place(self) -> str:
@@ -198,6 +201,10 @@ class LinkOptions:
         follower = bus.clock if isinstance(bus.clock, ReplayClock) else None
         if not self.ros and (self.tf or self.tf_prefix is not None):
             raise UsageError("--tf and --tf-prefix are for ROS: give --ros, such as --ros dds")
+        if not self.ros and self.odometry:
+            raise UsageError("--odometry is for ROS: give --ros, such as --ros dds")
+        if self.invert and not self.odometry:
+            raise UsageError("--invert is for the topics of --odometry: give one")
         if self.ros:
             async with AsyncExitStack() as stack:
                 links = []
@@ -225,6 +232,11 @@ class LinkOptions:
             topics = {"joint_topic": "joint_states", "description_topic": "robot_description"}
             options |= {option: f"{namespace}/{topic}" for option, topic in topics.items()}
             options |= {"tf": self.tf, "tf_static": [f"{topic}_static" for topic in self.tf]}
+        for topic in self.odometry:
+            if "=" in topic:
+                raise UsageError(f"--odometry {topic}: poses are read from recordings only, odometry from ROS too")
+        if self.odometry:
+            options |= {"odometry": self.odometry, "invert": self.invert}
         return ros_link(bus, place, prefix=self.tf_prefix, **options)
 
     def run_remote(self, program: Callable[[RemoteLookups], Awaitable[T]]) -> T:
@@ -290,7 +302,25 @@ class LinkOptions:
             say(f"hears {'nobody' if not peers else '1 peer' if peers == 1 else f'{peers:,} peers'} {self.route}")
 
 
+@Parameter(name="*", group=Group("How to join", sort_key=5))
+@dataclass(frozen=True, slots=True)
+class HearingOptions(LinkOptions):
+    """The options of a command that joins a domain to hear it.
+
+    Parameters
+    ----------
+    odometry
+        With --ros, a topic of nav_msgs/Odometry whose poses are transforms too; may be given several times.
+    invert
+        Make the child of the odometry the parent, because it has a parent already.
+    """
+
+    odometry: tuple[str, ...] = ()
+    invert: Flag = False
+
+
 DEFAULT_LINK = LinkOptions()
+DEFAULT_HEARING = HearingOptions()
 """The options of a command line that gives none."""
 
 

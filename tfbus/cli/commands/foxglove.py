@@ -1,7 +1,7 @@
 """``tfbus foxglove``."""
 
 from tfbus.cli.arguments import Port, usage_errors
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.domain import DEFAULT_HEARING, HearingOptions
 
 
 def foxglove(
@@ -9,7 +9,7 @@ def foxglove(
     port: Port = 8765,
     host: str = "127.0.0.1",
     origin: tuple[str, ...] = (),
-    link: LinkOptions = DEFAULT_LINK,
+    link: HearingOptions = DEFAULT_HEARING,
 ) -> None:
     """Show the frames of a domain to the Foxglove application, until Ctrl-C.
 

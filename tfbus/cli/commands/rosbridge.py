@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from tfbus.cli.arguments import Flag, Port, UsageError, usage_errors
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.domain import DEFAULT_HEARING, HearingOptions
 
 
 def rosbridge(
@@ -13,7 +13,7 @@ def rosbridge(
     origin: tuple[str, ...] = (),
     page: Path | None = None,
     publish: Flag = False,
-    link: LinkOptions = DEFAULT_LINK,
+    link: HearingOptions = DEFAULT_HEARING,
 ) -> None:
     """Serve the frames of a domain to web pages with roslib, as a rosbridge server of ROS does, until Ctrl-C.
 

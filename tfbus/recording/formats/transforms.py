@@ -311,6 +311,13 @@ def _raw(seconds: int, nanoseconds: int, parent: str, child: str, numbers: Seque
     return RawTransform(seconds, nanoseconds, parent.encode(), child.encode(), _NUMBERS.pack(*numbers))
 
 
+def _inverted(sample: TransformStamped | None) -> TransformStamped | None:
+    if sample is None:
+        return None
+    transform = sample.transform.inverse()
+    return TransformStamped(sample.child, sample.parent, sample.stamp, transform, sample.authority, sample.static)
+
+
 Run = tuple[str, int]
 """An authority, and the number of successive transforms that it sent."""
 
@@ -379,7 +386,7 @@ class ChannelDecoder:
         if self.prefix:
             decoded.samples[:] = map(self._prefixed, decoded.samples)
         if self._invert:
-            decoded.samples[:] = [sample and ~sample for sample in decoded.samples]
+            decoded.samples[:] = map(_inverted, decoded.samples)
         return decoded
 
     def count(self, payload: bytes) -> int:
