@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from support.recorded import SMALL, write_mcap
 
 from tfbus import RecordingError, Transform
-from tfbus.recording import load, open_recording
+from tfbus.recording import examine, load, open_recording
 
 CHOSEN = {"/odom": None, "/camera/pose": "camera", "/amcl": "amcl_base"}
 
@@ -93,6 +93,14 @@ def test_odometry_and_poses_are_samples_at_their_own_stamps(
             assert (sample.parent, sample.child) == (edge[::-1] if invert else edge)
             assert (sample.stamp, sample.static) == (5_000_000_000 + k, False)
             assert sample.transform.is_close(pose.inverse() if invert else pose)
+
+
+def test_odometry_and_poses_are_examined_with_the_frames_that_they_have(tmp_path: Path) -> None:
+    with open_recording(WRITERS[1](tmp_path), odometry=CHOSEN) as recording:
+        found = {(finding.kind, finding.frame) for finding in examine(recording)}
+    # Each message has another parent: the eight names of the frame.
+    assert ("two parents", "camera") in found
+    assert not {kind for kind, _ in found} & {"refused", "rotation", "unfinished"}
 
 
 @pytest.mark.parametrize(
