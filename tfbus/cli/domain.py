@@ -111,7 +111,7 @@ class LinkOptions:
     tf: tuple[str, ...] = ()
     tf_prefix: str | None = None
     backend: Backend = "asyncio"
-    # Those of `HearingOptions`, or of the command itself.
+    # Options of `HearingOptions`, or of the command itself.
     odometry: Annotated[tuple[str, ...], Parameter(parse=False)] = ()
     invert: Annotated[Flag, Parameter(parse=False)] = False
 

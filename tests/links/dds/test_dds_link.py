@@ -204,7 +204,7 @@ async def test_joints_the_time_and_a_description_come_from_topics_of_their_own(d
             await until(lambda: descriptions == ["<robot/>"])
             with anyio.fail_after(20):
                 while not states or not clock.now() or not end.heard:
-                    # Those that are not latched may be lost while the two meet.
+                    # Messages that are not latched may be lost while the two meet.
                     state = joints(Header(time, ""), ["a"], [0.5], [], [])
                     node.writer("rt/joint_states", RawJointState).write(state)
                     node.writer("rt/clock", RawClock).write(RawClock(time))
