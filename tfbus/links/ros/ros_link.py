@@ -50,7 +50,7 @@ class RosMessage:
     authority : str
         The node that has published it, or what is known of it.
     other : str
-        What it has if not transforms, see `Other`.
+        Its content, see `Other`; None for transforms.
     continues : bool
         Whether it is a later part of a large message.
     """
