@@ -266,13 +266,27 @@ async def test_all_frames_of_a_goal_go_into_one_message_a_period_and_are_as_new_
         assert await page.hear_all() == []
         bus.publish([*(moving("map", name, START) for name in names), static("map", "static")])
         assert len((await page.hear())["values"]["transforms"]) == 51
-        # Each at another time of the period, and all once more right before its end.
+        # When all are at rest, the first that moves is sent at once. The others move at other times of the period that
+        # begins then, and all of them right before its end.
+        await anyio.sleep(1.0)
         for number, name in enumerate(names):
             bus.publish(moving("map", name, START + 1 + number))
             await anyio.sleep(0.001)
         bus.publish([moving("map", name, START + 1_000) for name in names])
+        assert samples_of((await page.hear())["values"])[0][1:3] == (names[0], START + 1)
         heard = samples_of((await page.hear())["values"])
         assert {(child, stamp) for _, child, stamp, _ in heard} == {(name, START + 1_000) for name in names}
+
+
+@in_simulated_time
+async def test_feedback_waits_for_its_subscription_after_a_connection_has_broken(bus: Bus) -> None:
+    bus.publish(static("map", "base"))
+    async with RosbridgeServer(bus, 0) as server, page_of(server) as page:
+        stamped = {"goal_id": {"id": "g"}, "goal": goal(source_frames=["base"])}
+        await page.ask("publish", topic="/tf2_web_republisher/goal", msg=stamped)
+        await anyio.sleep(1.0)
+        await page.ask("subscribe", topic=FEEDBACK)
+        assert samples_of((await page.hear())["msg"]["feedback"]) == summary(static("map", "base"))
 
 
 async def test_a_jump_back_of_the_clock_begins_anew(bus: Bus) -> None:
