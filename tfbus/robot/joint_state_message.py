@@ -17,7 +17,7 @@ def decode_joint_state(payload: bytes, ros1: bool) -> tuple[int, dict[str, float
     try:
         stamp, _ = fields.header()
         count = fields.count()
-        if count * 4 > len(payload):
+        if count * 4 > len(payload) - 4:
             raise MalformedMessageError("truncated", f"{len(payload)} bytes cannot hold {count} names")
         names = [fields.text() for _ in range(count)]
         positions = fields.count()
