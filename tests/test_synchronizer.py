@@ -143,6 +143,28 @@ async def test_every_drop_is_counted_by_its_stream_and_reason() -> None:
     a.close()
 
 
+async def test_it_ends_when_the_last_message_of_a_stream_that_has_ended_finds_no_partner() -> None:
+    to_a, a = anyio.create_memory_object_stream[Message](9)
+    async with Synchronizer(a, replay([100]), within=1e-9) as sets:
+        await anyio.wait_all_tasks_blocked()
+        async with anyio.create_task_group() as tasks:
+            with anyio.fail_after(30.0):
+                tasks.start_soon(to_a.send, Message(500))
+                assert [messages async for messages in sets] == []
+    to_a.close()
+    a.close()
+
+
+@pytest.mark.parametrize("capacity", [1, 3])
+async def test_a_recording_with_a_slow_stream_is_read_to_its_end(capacity: int) -> None:
+    rare = [500, 900]
+    async with Synchronizer(replay(range(1_000)), replay(rare), within=1e-9, capacity=capacity, block=True) as sets:
+        with anyio.fail_after(30.0):
+            found = [tuple(message.stamp for message in messages) async for messages in sets]
+    assert found == [(500, 500), (900, 900)]
+    assert sets.dropped[0]["no partner"] == 899
+
+
 async def test_a_recording_is_not_read_faster_than_its_sets() -> None:
     async with Synchronizer(replay(range(500)), replay(range(500)), within=0.0, capacity=3, block=True) as sets:
         assert [messages[0].stamp async for messages in sets] == list(range(500))

@@ -112,9 +112,11 @@ class Matching:
         """Take out the sets that are certain now."""
         while all(self.queues):
             pivot = max(queue[0].stamp for queue in self.queues)
-            # Of each stream the number of messages before its last one up to the pivot.
-            places = [sum(entry.stamp <= pivot for entry in queue) - 1 for queue in self.queues]
-            known = [self._around(stream, place) for stream, place in enumerate(places)]
+            for stream, queue in enumerate(self.queues):
+                # Its last message up to the pivot is nearer to this pivot, and to all later ones.
+                while len(queue) > 1 and queue[1].stamp <= pivot:
+                    self.drop_oldest(stream, "no partner")
+            known = [(queue[0].stamp, queue[1].stamp if len(queue) > 1 else _NEVER) for queue in self.queues]
             width, later = _narrowest(pivot, known)
             # The same if each message to come has the best stamp that it can have.
             hoped = [self._hoped(stream, pivot, *stamps) for stream, stamps in enumerate(known)]
@@ -128,16 +130,11 @@ class Matching:
             ):
                 return
             found = []
-            for stream, (place, is_later) in enumerate(zip(places, later, strict=True)):
-                for _ in range(place + is_later):
+            for stream, is_later in enumerate(later):
+                if is_later:
                     self.drop_oldest(stream, "no partner")
                 found.append(self.queues[stream].popleft().message)
             yield tuple(found)
-
-    def _around(self, stream: int, place: int) -> tuple[int, int]:
-        """The stamps of a message and of the next one."""
-        queue = self.queues[stream]
-        return queue[place].stamp, queue[place + 1].stamp if place + 1 < len(queue) else _NEVER
 
     def _hoped(self, stream: int, pivot: int, before: int, after: int) -> tuple[int, int]:
         if after != _NEVER or self._ended[stream]:
@@ -255,7 +252,8 @@ class Synchronizer(AsyncOnly):
         least = [from_seconds(as_duration(each, "spacing")) for each in waits]
         self._matching = Matching(from_seconds(as_duration(within, "within")), least, self._dropped)
         self._stamp: Callable[[Any], int] = stamp or attrgetter("stamp")
-        self._capacity = capacity
+        # A set may need the message behind the one that waits.
+        self._capacity = max(capacity, 2) if block else capacity
         self._block = block
         self._buffer = buffer
         self._target = target
@@ -384,7 +382,7 @@ class Synchronizer(AsyncOnly):
             self._ready.append(messages)
             found = True
         self._make_room()
-        if found:
+        if found or self._matching.exhausted:
             self._reader.wake()
 
     def _make_room(self) -> None:

@@ -366,3 +366,56 @@ def _checked(parent: str | None, child: str | None, seconds: int, nanoseconds: i
         raise InvalidTransformError(f"a stamp has less than 1e9 nanosec, got {nanoseconds}", reason="stamp")
     stamp = seconds * SECOND + nanoseconds
     return TransformStamped(parent, child, stamp, Transform(row[:3], row[3:]), *tag)._fields
+
+
+class FieldReader:
+    """Reads the fields of another message with a header, one after another; `struct.error` if it ends too early.
+
+    Parameters
+    ----------
+    payload : bytes
+    ros1 : bool
+        Whether it is in the format of ROS 1, rather than CDR.
+    """
+
+    def __init__(self, payload: bytes, ros1: bool) -> None:
+        # CDR counts its alignment from the end of its header; a header of ROS 1 begins with the number of the message.
+        self._body = payload if ros1 else payload[4:]
+        self._ros1 = ros1
+        self._order = "<" if ros1 or payload[1:2] == b"\1" else ">"
+        self._at = 4 if ros1 else 0
+
+    def header(self) -> tuple[int, bytes]:
+        """The stamp in ns, and the name of the frame in UTF-8."""
+        seconds, nanoseconds = self._take(f"{'I' if self._ros1 else 'i'}I")
+        return seconds * SECOND + nanoseconds, self.text()
+
+    def count(self) -> int:
+        """A length."""
+        self._align(4)
+        (value,) = self._take("I")
+        return int(value)
+
+    def text(self) -> bytes:
+        """A text in UTF-8."""
+        length = self.count()
+        part = self._body[self._at : self._at + length]
+        if len(part) < length:
+            raise struct.error("the message ends inside of a text")
+        self._at += length
+        return part.rstrip(b"\0")
+
+    def doubles(self, count: int) -> tuple[float, ...]:
+        """So many float64."""
+        if count:
+            self._align(8)
+        return self._take(f"{count}d")
+
+    def _align(self, unit: int) -> None:
+        self._at += 0 if self._ros1 else -self._at % unit
+
+    def _take(self, layout: str) -> tuple[Any, ...]:
+        form = self._order + layout
+        values = struct.unpack_from(form, self._body, self._at)
+        self._at += struct.calcsize(form)
+        return values

@@ -327,9 +327,14 @@ def test_what_is_no_place_of_ros_is_a_usage_error(place: str, why: str) -> None:
 def test_the_topics_and_the_prefix_of_a_robot_in_a_namespace_are_given_to_every_place() -> None:
     pytest.importorskip("cyclonedds")
     from support.dds import DdsNode
+    from support.joint_messages import odometry
+
+    from tfbus.links.dds.types import RawOdometry
 
     domain_number = new_dds_domain()
     options = LinkOptions(ros=(f"dds:{domain_number}",), tf=("/robot1/tf",), tf_prefix="robot1/")
+    options = replace(options, odometry=("/visual/odom",), invert=True)
+    odom = RawOdometry.__idl__.deserialize(odometry(moving("visual", "base", SECOND, 2.0)))
 
     async def hear(bus: Bus) -> set[str]:
         with Buffer(bus) as buffer, DdsNode(domain_number) as node:
@@ -337,13 +342,22 @@ def test_the_topics_and_the_prefix_of_a_robot_in_a_namespace_are_given_to_every_
             node.writer("rt/robot1/tf")
             await buffer.lookup("robot1/base", "robot1/laser", timeout=PATIENCE)
             # The moving ones are not latched.
-            while not buffer.can_transform("robot1/map", "robot1/base"):
+            while not buffer.can_transform("robot1/map", "robot1/visual"):
+                node.writer("rt/visual/odom", RawOdometry).write(odom)
                 node.say(moving("map", "base", SECOND), topic="rt/robot1/tf")
                 node.say(moving("map", "other", SECOND), topic="rt/tf")
                 await anyio.sleep(0.02)
+            assert buffer.tree.parent("robot1/visual") == "robot1/base"
             return set(buffer.tree.frames())
 
-    assert options.run(hear) == {"robot1/map", "robot1/base", "robot1/laser"}
+    assert options.run(hear) == {"robot1/map", "robot1/base", "robot1/laser", "robot1/visual"}
+    for wrong, why in (
+        (LinkOptions(odometry=("/odom",)), "--odometry is for ROS"),
+        (replace(options, odometry=()), "--invert is for the topics of --odometry"),
+        (replace(options, odometry=("/pose=camera",)), "--odometry /pose=camera: poses are read from recordings only"),
+    ):
+        with pytest.raises(UsageError, match=why):
+            join(wrong)
     for wrong in (LinkOptions(tf=("/a/tf",)), LinkOptions(tf_prefix="a/")):
         with pytest.raises(UsageError, match="--tf, --tf-prefix and --ros-offset are for ROS"):
             join(wrong)

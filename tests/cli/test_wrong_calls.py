@@ -13,7 +13,14 @@ from tfbus import SECOND
 
 START = 1_700_000_000 * SECOND
 ARM = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
-NEEDS = {"plot": "matplotlib", "view": "trimesh", "foxglove": "foxglove", "robot": "urdf_parser_py", "router": "zenoh"}
+NEEDS = {
+    "plot": "matplotlib",
+    "view": "trimesh",
+    "foxglove": "foxglove",
+    "rosbridge": "wsproto",
+    "robot": "urdf_parser_py",
+    "router": "zenoh",
+}
 """The packages of the extras that commands need, by the names under which they are imported."""
 
 
@@ -61,6 +68,7 @@ NEEDS = {"plot": "matplotlib", "view": "trimesh", "foxglove": "foxglove", "robot
         ("foxglove --port -1", "--port"),
         ("foxglove --port 65536", "--port"),
         ("foxglove --origin robot.example", "robot.example"),
+        ("rosbridge --origin robot.example", "robot.example"),
         ("view --origin robot.example", "robot.example"),
         ("view run.mcap --port 65536", "--port"),
         ("view run.mcap --fixed /map", "/map"),

@@ -22,7 +22,7 @@ import anyio
 import httpx
 import pytest
 import uvicorn
-from support.processes import Program
+from support.processes import Program, free_ports
 from support.samples import moving, static, tree_of
 from websockets.asyncio.client import connect as connect_async
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -547,6 +547,28 @@ def test_nothing_stays_in_the_web_application_of_clients_that_have_left() -> Non
             await serving
 
     asyncio.run(main())
+
+
+def test_the_page_with_roslib_gets_the_robot_on_its_circle() -> None:
+    pytest.importorskip("wsproto", reason="serving pages with roslib needs wsproto")
+    (port,) = free_ports(1)
+    command = [sys.executable, str(DEMOS / "tf_in_page.py"), str(port)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            address = process.stdout.readline().strip()
+            page = httpx.get(address, timeout=30, trust_env=False).text
+            assert "new ROSLIB.TFClient(" in page
+            with connect(address.replace("http:", "ws:"), proxy=None, origin=Origin(address)) as socket:
+                goal = {"source_frames": ["laser"], "target_frame": "map", "rate": 20}
+                request = {"op": "send_action_goal", "id": "1", "action": "/tf2_web_republisher", "action_type": ""}
+                socket.send(json.dumps({**request, "args": goal, "feedback": True}))
+                (found,) = json.loads(socket.recv(timeout=30))["values"]["transforms"]
+        finally:
+            process.terminate()
+    x, y, z = found["transform"]["translation"].values()
+    # The laser is 0.1 m ahead on the tangent of the circle of 1 m.
+    assert (math.hypot(x, y), z) == pytest.approx((math.hypot(1.0, 0.1), 0.2))
 
 
 @pytest.mark.parametrize("loop", ["asyncio", pytest.param("uvloop", marks=pytest.mark.thorough)])

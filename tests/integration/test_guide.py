@@ -86,7 +86,7 @@ PROGRAMS = [
 ]
 TYPED = [(page, command) for page in PAGES for command in commands_of(page)]
 COMMANDS = [pytest.param(command, id=f"{page.stem}-{command}") for page, command in TYPED]
-OUTSIDE = re.compile(r"--(ros|connect|listen|svg) |^pip|dds|^tfbus (router|view|foxglove)")
+OUTSIDE = re.compile(r"--(ros|connect|listen|svg) |^pip|dds|^tfbus (router|view|foxglove|rosbridge)")
 """A command that needs another machine, ROS, a browser, Graphviz, or a port that may be taken."""
 OWN = {command: page.stem for page, command in TYPED if not OUTSIDE.search(command)}
 OF_FILES = re.compile(r"tfbus (info|query|convert|compare|plot|check \S+\.|robot .*--tree)")

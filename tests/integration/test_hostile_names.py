@@ -363,7 +363,7 @@ ON_DOMAIN = {
 }
 OF_BOTH = {"play": ("play", 0, "--rate", "inf"), "record": ("record", "NEW", "--duration", "0")}
 # These print only names that their user gives, and texts of errors.
-OWN = {"bridge", "broadcast", "demo", "foxglove", "listen", "router", "view"}
+OWN = {"bridge", "broadcast", "demo", "foxglove", "listen", "rosbridge", "router", "view"}
 
 
 def test_every_command_is_walked_or_prints_no_names() -> None:

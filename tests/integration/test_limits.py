@@ -30,7 +30,11 @@ links.rosbridge.rosbridge_link.MOST_QUEUED links.rosbridge.rosbridge_link.SILENC
 links.rosbridge.rosbridge_link.MOST_SAID links.rosbridge.protocol.MAX_VALUE links.rosbridge.protocol.MAX_TEXT
 links.rosbridge.protocol.MOST_TRANSFORMS links.rosbridge.protocol.QUEUE links.dds.dds_link._DEPTH
 links.dds.dds_link._KEPT links.dds.readers.MOST_WAITING links.dds.readers.MOST_BYTES links.ros.settings._LAST_DOMAIN
-_aio.web_door.MAX_HEAD _aio.web_door.HEAD_TIME _aio.web_server.MAX_CONNECTIONS view.view._ORDERS
+_aio.web_door.MAX_HEAD _aio.web_door.HEAD_TIME _aio.web_server.MAX_CONNECTIONS
+links.rosbridge.rosbridge_server.MAX_REQUEST links.rosbridge.rosbridge_server.MOST_FRAMES
+links.rosbridge.rosbridge_server.MOST_REQUESTS links.rosbridge.rosbridge_server.MOST_WAITING
+links.rosbridge.rosbridge_server.MOST_CONFLATED links.rosbridge.rosbridge_server.MOST_AT_ONCE
+links.rosbridge.rosbridge_server.LONGEST_ERROR view.view._ORDERS
 view.session.EVENTS_KEPT view.session.SAMPLES view.session.MAX_TRAILS recording.points.MAX_POINTS
 view.session.MAX_MESSAGE view.meshes.MAX_BYTES view.meshes.MAX_NUMBERS view.meshes.MAX_VERTICES view.meshes.MAX_SHAPES
 plot.plots.SAMPLES plot.plots.LONGEST_NAME

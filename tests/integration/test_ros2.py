@@ -5,12 +5,14 @@ The variable ``ROS2_PYTHON`` names a Python with rclpy and tf2_ros, such as ``/u
 variable ``ROSBRIDGE`` is a command that serves a rosbridge at the port that is its last argument.
 """
 
+import json
 import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, asynccontextmanager, contextmanager
 from functools import partial
@@ -33,14 +35,15 @@ from support.both_sides import (
     node,
 )
 from support.processes import free_ports, new_dds_domain, on_one_loop
+from support.recorded import SMALL
 
-from tfbus import Buffer, Bus
+from tfbus import Buffer, Bus, PointStamped, Synchronizer
 from tfbus.links.ros import RosLink
+from tfbus.recording import load
 
 pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
 
 PEER = Path(__file__).parents[1] / "support" / "ros2_peer.py"
-MESSAGES = PEER.with_name("real_ros_messages.py")
 WATCHER = PEER.with_name("ros2_watcher.py")
 ROBOT = PEER.with_name("ros2_robot.py")
 CYCLONE_PEER = PEER.with_name("cyclone_peer.py")
@@ -228,8 +231,39 @@ async def test_ros_lists_a_link_over_dds_as_a_node_with_what_it_publishes_until_
     assert topics == ["/tf", "/tf_static"]
 
 
-def test_messages_of_rclpy_become_data_and_messages_again() -> None:
-    # The Python of ROS comes first, for its numpy.
-    script = f"import sys, runpy; sys.path += {sys.path!r}; runpy.run_path({str(MESSAGES)!r}, run_name='__main__')"
-    done = subprocess.run([ros2_python(", numpy"), "-c", script], capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr) == ("equal 11\n", "")
+def run_beside_ros(script: Path, needed: str, content: str = "") -> subprocess.CompletedProcess[str]:
+    """Run a script by the Python of ROS, which comes first, for its numpy."""
+    program = f"import sys, runpy; sys.path += {sys.path!r}; runpy.run_path({str(script)!r}, run_name='__main__')"
+    command = [ros2_python(f", {needed}"), "-c", program]
+    return subprocess.run(command, input=content, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("script", "needed", "equal"),
+    [("real_ros_messages.py", "numpy", 11), ("real_tf2_geometry.py", "tf2_geometry_msgs", 800)],
+)
+def test_messages_are_those_of_ros_again_and_are_transformed_as_there(script: str, needed: str, equal: int) -> None:
+    done = run_beside_ros(PEER.with_name(script), needed)
+    assert (done.stdout, done.stderr) == (f"equal {equal}\n", "")
+
+
+@pytest.mark.parametrize("width", [5_000_000, 20_000_000])
+async def test_recorded_streams_have_the_sets_that_message_filters_finds(width: int) -> None:
+    recorded = load(SMALL, problems=Counter())
+    streams: list[list[int]] = []
+    for frame in ("base_link", "beacon", "gripper"):
+        stamps = recorded.samples(frame).stamps
+        assert stamps is not None
+        streams.append(sorted(set(map(int, stamps))))
+
+    async def replay(stamps: list[int]) -> AsyncIterator[PointStamped]:
+        for stamp in stamps:
+            yield PointStamped("x", stamp, (0.0, 0.0, 0.0))
+
+    for chosen in (streams, streams[:2], streams[1:], streams[::2]):
+        done = run_beside_ros(PEER.with_name("real_message_filters.py"), "message_filters", json.dumps([chosen, width]))
+        assert done.stderr == ""
+        # There, a set is narrower than the width.
+        async with Synchronizer(*map(replay, chosen), within=(width - 1) / 1e9, block=True) as sets:
+            found = [[point.stamp for point in points] async for points in sets]
+        assert found == json.loads(done.stdout)

@@ -32,7 +32,7 @@ from tfbus.links.foxglove import FoxgloveServer
 from tfbus.links.local.local_wire import LocalWire
 from tfbus.links.message import Kind, write_body
 from tfbus.links.rmw_zenoh import RmwZenohLink
-from tfbus.links.rosbridge import RosbridgeLink
+from tfbus.links.rosbridge import RosbridgeLink, RosbridgeServer
 from tfbus.links.zenoh import ZenohLink, ZenohRouter, zenoh_router
 from tfbus.links.zenoh.sessions import client_config, open_session
 from tfbus.view import View
@@ -76,6 +76,7 @@ Made = Callable[[Bus, Buffer], AbstractAsyncContextManager[Any]]
 SERVERS: dict[str, Made] = {
     "View": lambda bus, buffer: View(bus, buffer, 0),
     "FoxgloveServer": lambda bus, _: FoxgloveServer(bus, 0),
+    "RosbridgeServer": lambda bus, buffer: RosbridgeServer(bus, 0, buffer=buffer),
 }
 
 

@@ -14,7 +14,7 @@ from support.recorded import SMALL, write_mcap
 
 from tfbus import Covariance, RecordingError, Transform, UncertainSample
 from tfbus.geometry.covariance import inverse_jacobian
-from tfbus.recording import load, open_recording
+from tfbus.recording import examine, load, open_recording
 
 KNOWN = Covariance(np.diag(np.arange(1.0, 7.0)) + np.eye(6, k=1) * 0.1 + np.eye(6, k=-1) * 0.1)
 CHOSEN = {"/odom": None, "/camera/pose": "camera", "/amcl": "amcl_base"}
@@ -102,6 +102,14 @@ def test_odometry_and_poses_are_samples_at_their_own_stamps(
             assert sample.kind == ("drift" if child.startswith("base") and not invert else "independent")
             jacobian = inverse_jacobian(pose) if invert else np.eye(6)
             assert sample.covariance.matrix == pytest.approx(jacobian @ KNOWN.matrix @ jacobian.T)
+
+
+def test_odometry_and_poses_are_examined_with_the_frames_that_they_have(tmp_path: Path) -> None:
+    with open_recording(WRITERS[1](tmp_path), odometry=CHOSEN) as recording:
+        found = {(finding.kind, finding.frame) for finding in examine(recording)}
+    # Each message has another parent: the eight names of the frame.
+    assert ("two parents", "camera") in found
+    assert not {kind for kind, _ in found} & {"refused", "rotation", "unfinished"}
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,11 @@
-"""Messages with the positions of joints, by `rosbags`."""
+"""Messages with the positions of joints, and with odometry, by `rosbags`."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
+
+from tfbus import TransformStamped
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 KIND = "sensor_msgs/msg/JointState"
@@ -20,3 +22,23 @@ def joint_state(
     none = np.array([])
     message = kinds[KIND](header, [*positions, *more_names], np.array(list(positions.values())), none, none)
     return bytes(TYPES.serialize_cdr(message, KIND, little_endian=little_endian))
+
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+def odometry(sample: TransformStamped, little_endian: bool = True) -> bytes:
+    """Odometry in CDR, with the pose of a sample; its other numbers are 7."""
+    make, stamp = TYPES.types, divmod(sample.stamp, 10**9)
+    header = make["std_msgs/msg/Header"](make["builtin_interfaces/msg/Time"](*stamp), sample.parent)
+    position = make["geometry_msgs/msg/Point"](*sample.transform.translation)
+    turn = make["geometry_msgs/msg/Quaternion"](*sample.transform.rotation)
+    pose = make["geometry_msgs/msg/PoseWithCovariance"](
+        make["geometry_msgs/msg/Pose"](position, turn), np.full(36, 7.0)
+    )
+    still = make["geometry_msgs/msg/Vector3"](7.0, 7.0, 7.0)
+    twist = make["geometry_msgs/msg/TwistWithCovariance"](
+        make["geometry_msgs/msg/Twist"](still, still), np.full(36, 7.0)
+    )
+    message = make[ODOMETRY](header, sample.child, pose, twist)
+    return bytes(TYPES.serialize_cdr(message, ODOMETRY, little_endian=little_endian))

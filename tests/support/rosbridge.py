@@ -221,27 +221,35 @@ async def joined(
 # A client of rosbridge that is not ours: npm's roslib, in a process of its own
 
 _PROGRAM = """
-import { Ros, Topic } from "roslib";
+import * as roslib from "roslib";
+const { Ros, Topic, TFClient, ROS2TFClient } = roslib.default ?? roslib;
 const say = (fact) => console.log(JSON.stringify(fact));
-const ros = new Ros({ url: process.argv[2] });
+const [url, client] = process.argv.slice(2);
+const ros = new Ros({ url, groovyCompatibility: client !== "service" });
 ros.on("error", (error) => { say({ error: String(error) }); process.exit(1); });
 ros.on("connection", () => {
   for (const name of ["/tf_static", "/tf"]) {
     const topic = new Topic({ ros, name, messageType: "tf2_msgs/TFMessage" });
     topic.subscribe((message) => say({ topic: name, transforms: message.transforms }));
   }
+  if (client !== "") {
+    const tf = new (client === "ROS2TFClient" ? ROS2TFClient : TFClient)({ ros, fixedFrame: "map" });
+    for (const frame of ["base", "/laser"]) {
+      tf.subscribe(frame, (transform) => say({ frame: frame.replace("/", ""), transform }));
+    }
+  }
   say({ connected: true });
 });
 """
 
 
-def install_roslib(folder: Path) -> None:
-    """Install roslib into a folder; skips the test if it cannot be had."""
+def install_roslib(folder: Path, *packages: str) -> None:
+    """Install roslib, or these packages of npm, into a folder; skips the test if they cannot be had."""
     node, npm = shutil.which("node"), shutil.which("npm")
     if node is None or npm is None:
         pytest.skip("roslib needs node and npm")
     (folder / "package.json").write_text('{"private": true, "type": "module"}')
-    command = [npm, "install", "roslib", "--no-audit", "--no-fund"]
+    command = [npm, "install", *(packages or ("roslib",)), "--no-audit", "--no-fund"]
     try:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
     except subprocess.TimeoutExpired:
@@ -252,11 +260,11 @@ def install_roslib(folder: Path) -> None:
 
 
 @asynccontextmanager
-async def roslib_client(folder: Path, url: str) -> AsyncIterator[list[dict[str, Any]]]:
-    """The transforms that roslib, subscribed to ``/tf`` and ``/tf_static``, has heard."""
+async def roslib_client(folder: Path, url: str, client: str = "") -> AsyncIterator[list[dict[str, Any]]]:
+    """The transforms that roslib, subscribed to ``/tf`` and ``/tf_static``, has heard, and those of a client of tf."""
     heard: list[dict[str, Any]] = []
     async with (
-        await anyio.open_process(["node", "listen.js", url], cwd=folder, stderr=None) as process,
+        await anyio.open_process(["node", "listen.js", url, client], cwd=folder, stderr=None) as process,
         anyio.create_task_group() as tasks,
     ):
         connected = anyio.Event()
@@ -266,7 +274,7 @@ async def roslib_client(folder: Path, url: str) -> AsyncIterator[list[dict[str, 
             assert process.stdout is not None
             async for piece in process.stdout:
                 *lines, rest = (rest + piece).split(b"\n")
-                for line in lines:
+                for line in filter(lambda line: line.startswith(b"{"), lines):
                     fact = json.loads(line)
                     assert "error" not in fact, fact
                     if "connected" in fact:

@@ -44,11 +44,17 @@ class WebServer:
 
     Raises
     ------
+    TypeError, ValueError
+        If the port is no int, or out of range.
     OSError
         On entering, if nobody can listen there.
     """
 
     def __init__(self, host: str, port: int, door: WebDoor, answer: Answer, search: bool = False) -> None:
+        if isinstance(port, bool) or not isinstance(port, int):
+            raise TypeError(f"a port must be an int, not {port!r}")
+        if not 0 <= port <= 65_535:
+            raise ValueError(f"a port must be from 0 to 65535, got {port}")
         self.place: str = ""
         self._host, self._port, self._search = host, port, search
         self._door = door

@@ -36,6 +36,8 @@ COMMANDS = {
     "query": "Print the transform of SOURCE in TARGET from a recording: the newest, at an instant, or at many.",
     "record": "Record all transforms of a domain to FILE, in MCAP as ROS 2 and Foxglove read it, until Ctrl-C.",
     "robot": "Publish the frames of a robot until Ctrl-C, or print them as a tree.",
+    "rosbridge": "Serve the frames of a domain to web pages with roslib, as a rosbridge server of ROS does, until "
+    "Ctrl-C.",
     "router": "Connect the programs of all domains with each other, until Ctrl-C.",
     "static": "Publish the static transform of CHILD in PARENT, or all transforms of a file, until Ctrl-C.",
     "tree": "Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.",

@@ -16,9 +16,9 @@ from typing import Annotated, Any, Protocol, TypeVar
 
 from cyclopts import Group, Parameter
 
-from tfbus.cli.arguments import Backend, UsageError, usage_errors
+from tfbus.cli.arguments import Backend, Flag, UsageError, usage_errors
 from tfbus.cli.lazy_imports import lazy_imports
-from tfbus.cli.output import say, warn
+from tfbus.cli.output import print_now, say, warn
 
 with lazy_imports():
     import anyio
@@ -29,6 +29,7 @@ with lazy_imports():
     from tfbus.clock import Clock, SimulatedClock
     from tfbus.errors import InvalidTransformError, pip_install
     from tfbus.geometry.stamped import TransformStamped
+    from tfbus.links.bus_server import BusServer
     from tfbus.links.link import DomainLink, DomainOptions, Link
     from tfbus.links.local import LocalLink
 
@@ -114,6 +115,9 @@ class LinkOptions:
     tf_prefix: str | None = None
     ros_offset: float = 0.0
     backend: Backend = "asyncio"
+    # Options of `HearingOptions`, or of the command itself.
+    odometry: Annotated[tuple[str, ...], Parameter(parse=False)] = ()
+    invert: Annotated[Flag, Parameter(parse=False)] = False
 
     @property
     def place(self) -> str:
@@ -164,6 +168,31 @@ class LinkOptions:
 
         return run(join_and_run, self.backend)
 
+    def serve(self, server_of: Callable[[Bus], BusServer], hint: str) -> None:
+        """Run a server of the joined bus until Ctrl-C; its address is printed, and the hint, which may have a {place}.
+
+        Raises
+        ------
+        UsageError
+            If the server cannot be made, or cannot listen at its address.
+        """
+
+        async def serve(bus: Bus) -> None:
+            with usage_errors():
+                server = server_of(bus)
+            try:
+                await server.__aenter__()
+            except OSError as error:
+                raise UsageError(str(error)) from None
+            try:
+                print_now(server.address)
+                say(hint.format(place=server.address.removeprefix("ws://")))
+                await anyio.sleep_forever()
+            finally:
+                await server.__aexit__(None, None, None)
+
+        self.run(serve)
+
     @asynccontextmanager
     async def join(self, bus: Bus) -> AsyncIterator[Sequence[Link]]:
         """Link a bus to the domain, or to ROS, for the body of an ``async with``, which is given the links.
@@ -176,6 +205,10 @@ class LinkOptions:
         follower = bus.clock if isinstance(bus.clock, ReplayClock) else None
         if not self.ros and (self.tf or self.tf_prefix is not None or self.ros_offset):
             raise UsageError("--tf, --tf-prefix and --ros-offset are for ROS: give --ros, such as --ros dds")
+        if not self.ros and self.odometry:
+            raise UsageError("--odometry is for ROS: give --ros, such as --ros dds")
+        if self.invert and not self.odometry:
+            raise UsageError("--invert is for the topics of --odometry: give one")
         if self.ros:
             async with AsyncExitStack() as stack:
                 links = []
@@ -203,6 +236,11 @@ class LinkOptions:
             topics = {"joint_topic": "joint_states", "description_topic": "robot_description"}
             options |= {option: f"{namespace}/{topic}" for option, topic in topics.items()}
             options |= {"tf": self.tf, "tf_static": [f"{topic}_static" for topic in self.tf]}
+        for topic in self.odometry:
+            if "=" in topic:
+                raise UsageError(f"--odometry {topic}: poses are read from recordings only, odometry from ROS too")
+        if self.odometry:
+            options |= {"odometry": self.odometry, "invert": self.invert}
         return ros_link(bus, place, prefix=self.tf_prefix, offset=self.ros_offset, **options)
 
     def run_remote(self, program: Callable[[RemoteLookups], Awaitable[T]]) -> T:
@@ -268,7 +306,25 @@ class LinkOptions:
             say(f"hears {'nobody' if not peers else '1 peer' if peers == 1 else f'{peers:,} peers'} {self.route}")
 
 
+@Parameter(name="*", group=Group("How to join", sort_key=5))
+@dataclass(frozen=True, slots=True)
+class HearingOptions(LinkOptions):
+    """The options of a command that joins a domain to hear it.
+
+    Parameters
+    ----------
+    odometry
+        With --ros, a topic of nav_msgs/Odometry whose poses are transforms too; may be given several times.
+    invert
+        Make the child of the odometry the parent, because it has a parent already.
+    """
+
+    odometry: tuple[str, ...] = ()
+    invert: Flag = False
+
+
 DEFAULT_LINK = LinkOptions()
+DEFAULT_HEARING = HearingOptions()
 """The options of a command line that gives none."""
 
 

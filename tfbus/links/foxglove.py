@@ -8,20 +8,17 @@ import secrets
 import threading
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from types import TracebackType
-from typing import Self
 
 import anyio
 import anyio.abc
 import anyio.to_thread
 
 from tfbus._aio.loops import LoopWaker
-from tfbus._aio.web_door import WebDoor
-from tfbus._aio.web_server import WebServer
 from tfbus.bus.bus import Bus
-from tfbus.errors import BusClosedError, pip_install
+from tfbus.errors import pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.registration import AsyncOnly, Registration, warn_unless_entered
+from tfbus.links.bus_server import BusServer
+from tfbus.registration import Registration
 from tfbus.stamps import SECOND
 
 try:
@@ -40,7 +37,7 @@ _STAMP_END = 2**32 * SECOND
 """ns; Foxglove counts the seconds of a stamp in 32 bits, from zero."""
 
 
-class FoxgloveServer(AsyncOnly):
+class FoxgloveServer(BusServer):
     """Sends everything that a bus publishes to the Foxglove application: ``async with FoxgloveServer(bus) as server``.
 
     The transforms are messages of the type ``foxglove.FrameTransforms``; who subscribes later gets the static ones at
@@ -91,17 +88,10 @@ class FoxgloveServer(AsyncOnly):
         topic: str = "/tf",
         origins: Iterable[str] = APPLICATION,
     ) -> None:
-        if isinstance(port, bool) or not isinstance(port, int):
-            raise TypeError(f"a port must be an int, not {port!r}")
-        if not 0 <= port <= 65_535:
-            raise ValueError(f"a port must be from 0 to 65535, got {port}")
-        self.bus = bus
-        self.address: str = ""
+        super().__init__(bus, host, port, origins, self._pass_in)
         self.sent: int = 0
         self.not_sent: int = 0
         self._topic = topic
-        self._front = WebServer(host, port, WebDoor(host, origins), self._pass_in)
-        self._entered = False
         self._listener = _Listener(self._wake)
         self._waker = LoopWaker(self._follow_subscriptions)
         self._served: frozenset[int] = frozenset()
@@ -110,46 +100,15 @@ class FoxgloveServer(AsyncOnly):
         self._context: foxglove.Context
         self._channel: FrameTransformsChannel
         self._server: WebSocketServer | None = None
-        self._never_entered = warn_unless_entered(self)
         self._inside = ("", 0)
 
-    @property
-    def refused(self) -> int:
-        """Connections that were refused."""
-        return self._front.refused
-
-    async def __aenter__(self) -> Self:
-        if self._entered:
-            raise RuntimeError("a server is entered once: make another one")
-        self.bus._check_thread()
-        if self.bus.closed:
-            raise BusClosedError
-        self._entered = True
-        self.bus._entered.add(self)
-        self._never_entered.detach()
+    async def _open(self) -> None:
         self._waker.bind()
-        try:
-            # A cancellation must not lose a server that a thread has started.
-            with anyio.CancelScope(shield=True):
-                self._server = await anyio.to_thread.run_sync(self._start)
-            await self._front.__aenter__()
-        except BaseException:
-            await self._stop()
-            raise
-        self.address = f"ws://{self._front.place}"
-        return self
+        # A cancellation must not lose a server that a thread has started.
+        with anyio.CancelScope(shield=True):
+            self._server = await anyio.to_thread.run_sync(self._start)
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            await self._front.__aexit__(None, None, None)
-        finally:
-            await self._stop()
-
-    async def _stop(self) -> None:
-        self.address = ""
-        self.bus._entered.discard(self)
+    async def _close(self) -> None:
         server, self._server = self._server, None
         self._unsubscribe()
         if server is not None:

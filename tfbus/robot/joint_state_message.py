@@ -2,8 +2,7 @@
 
 import struct
 
-from tfbus.stamps import SECOND
-from tfbus.tf_message import MalformedMessageError
+from tfbus.tf_message import FieldReader, MalformedMessageError
 
 
 def decode_joint_state(payload: bytes, ros1: bool) -> tuple[int, dict[str, float]]:
@@ -14,46 +13,17 @@ def decode_joint_state(payload: bytes, ros1: bool) -> tuple[int, dict[str, float
     MalformedMessageError
         If the payload ends too early, or has fewer positions than names.
     """
-    # CDR counts its alignment from the end of its header; a header of ROS 1 begins with the number of the message.
-    body = payload if ros1 else payload[4:]
-    order = "<" if ros1 or payload[1:2] == b"\1" else ">"
-    size = struct.Struct(f"{order}I")
-    at = 4 if ros1 else 0
-
-    def align(unit: int) -> None:
-        nonlocal at
-        at += 0 if ros1 else -at % unit
-
-    def number() -> int:
-        nonlocal at
-        align(4)
-        (value,) = size.unpack_from(body, at)
-        at += 4
-        return int(value)
-
-    def text() -> str:
-        nonlocal at
-        length = number()
-        part = body[at : at + length]
-        if len(part) < length:
-            raise MalformedMessageError("truncated", f"{len(payload)} bytes end inside of a string")
-        at += length
-        return part.rstrip(b"\0").decode(errors="replace")
-
+    fields = FieldReader(payload, ros1)
     try:
-        seconds, nanoseconds = struct.unpack_from(f"{order}{'I' if ros1 else 'i'}I", body, at)
-        at += 8
-        text()
-        count = number()
-        if count * 4 > len(body):
+        stamp, _ = fields.header()
+        count = fields.count()
+        if count * 4 > len(payload) - 4:
             raise MalformedMessageError("truncated", f"{len(payload)} bytes cannot hold {count} names")
-        names = [text() for _ in range(count)]
-        positions = number()
+        names = [fields.text() for _ in range(count)]
+        positions = fields.count()
         if positions < count:
             raise MalformedMessageError("positions", f"there are {count} names, and {positions} positions")
-        if positions:
-            align(8)
-        values = struct.unpack_from(f"{order}{count}d", body, at)
+        values = fields.doubles(count)
     except struct.error:
         raise MalformedMessageError("truncated", f"{len(payload)} bytes are too few") from None
-    return seconds * SECOND + nanoseconds, dict(zip(names, values, strict=True))
+    return stamp, {name.decode(errors="replace"): value for name, value in zip(names, values, strict=True)}

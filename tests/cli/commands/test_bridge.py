@@ -1,3 +1,4 @@
+import json
 import os
 
 import anyio
@@ -6,7 +7,8 @@ import pytest
 from support.processes import free_address, new_domain, start_tfbus, until
 from support.samples import latched, moving, static
 
-from tfbus import Bus
+from tfbus import Buffer, Bus
+from tfbus.links.ros.messages import as_mapping
 
 
 @pytest.mark.thorough
@@ -42,12 +44,19 @@ async def test_a_bridge_between_rosbridge_and_rmw_zenoh_tells_what_is_refused_an
     async with rosbridge_server() as server, ZenohRouter(address):
         server.latched["/tf_static"] = (static("map", "lidar", 2.0, 3),)
         place = f"zenoh:{address.removeprefix('tcp/')}"
-        with Bus() as bus, start_tfbus("bridge", server.url, place) as bridge:
+        words = ("bridge", server.url, place, "--odometry", "/odom")
+        with Bus() as bus, Buffer(bus) as buffer, start_tfbus(*words) as bridge:
             await anyio.to_thread.run_sync(bridge.errors.expect, "passing on")
-            async with RmwZenohLink(bus, address) as link:
+            async with RmwZenohLink(bus, address):
                 await until(lambda: "lidar" in latched(bus))
                 bus.publish(static("map", "camera", 1.0, 4))
                 await until(lambda: "/tf_static" in server.operations("publish"))
+                row = as_mapping(moving("odom", "cart", 5))
+                pose = {"position": row["transform"]["translation"], "orientation": row["transform"]["rotation"]}
+                odometry = {"op": "publish", "topic": "/odom", "msg": {**row, "pose": {"pose": pose}}}
+                while not buffer.can_transform("odom", "cart"):
+                    await server.say_anything(json.dumps(odometry))
+                    await anyio.sleep(0.02)
                 for _ in range(2):
                     await server.say_anything("nonsense")
                 told = await anyio.to_thread.run_sync(bridge.errors.expect, "refused what peer")
@@ -61,7 +70,7 @@ async def test_a_bridge_between_rosbridge_and_rmw_zenoh_tells_what_is_refused_an
                 await until(lambda: "radar" in latched(bus))
                 await until(lambda: server.operations("publish").count("/tf_static") == 2)
                 stamp = 0
-                while not link.statistics().received_samples > 2:
+                while not buffer.can_transform("map", "base"):
                     await server.say(moving("map", "base", stamp := stamp + 1))
                     await anyio.sleep(0.02)
             assert await anyio.to_thread.run_sync(bridge.end) == 130

@@ -14,6 +14,7 @@ from xml.etree import ElementTree as ET
 import anyio
 import anyio.to_thread
 import pytest
+from support.joint_messages import odometry
 from support.processes import until
 from support.ros import named
 from support.samples import latched, moving, static
@@ -35,6 +36,7 @@ from tfbus.links.dds.types import (
     RawClock,
     RawEntitiesInfo,
     RawJointState,
+    RawOdometry,
     RawString,
     RawTFMessage,
     Time,
@@ -190,22 +192,26 @@ async def test_joints_the_time_and_a_description_come_from_topics_of_their_own(d
         "joint_states": lambda *state: states.append(state),
         "robot_description": descriptions.append,
         "clock": clock,
+        "odometry": "/odom",
     }
     joints: Any = RawJointState
     time: Any = Time(100, 5)
+    pose = RawOdometry.__idl__.deserialize(odometry(moving("odom", "base", 7, 1.5)))
     with DdsNode(domain_number) as node:
         # Latched, so it may come long before the link.
         node.writer("rt/robot_description", RawString).write(RawString("<robot/>"))
         async with joined(domain_number, **options) as end:
             await until(lambda: descriptions == ["<robot/>"])
             with anyio.fail_after(20):
-                while not states or not clock.now():
-                    # The two that are not latched may be lost while the two meet.
+                while not states or not clock.now() or not end.heard:
+                    # Messages that are not latched may be lost while the two meet.
                     state = joints(Header(time, ""), ["a"], [0.5], [], [])
                     node.writer("rt/joint_states", RawJointState).write(state)
                     node.writer("rt/clock", RawClock).write(RawClock(time))
+                    node.writer("rt/odom", RawOdometry).write(pose)
                     await anyio.sleep(0.01)
             assert end.link.statistics().rejected == {}
+    assert end.heard[0] == moving("odom", "base", 7, 1.5, "/odom")
     assert states[0] == ({"a": 0.5}, 100_000_000_005)
     assert clock.now() == 100_000_000_005
 

@@ -20,7 +20,7 @@ import zenoh.ext
 from rosbags.typesys import Stores, get_typestore
 from support.both_sides import SECONDS, Node, check_killed_node, check_link_that_came_back, meet, node
 from support.damage import damaged
-from support.joint_messages import joint_state
+from support.joint_messages import joint_state, odometry
 from support.processes import free_ports, on_one_loop, until
 from support.samples import latched, moving, static
 
@@ -32,6 +32,8 @@ from tfbus.links.rmw_zenoh.rmw_zenoh_link import (
     HASH,
     JOINT_HASH,
     JOINT_TYPE,
+    ODOMETRY_HASH,
+    ODOMETRY_TYPE,
     TEXT_HASH,
     TEXT_TYPE,
     TYPE,
@@ -114,6 +116,7 @@ def test_the_hash_is_that_of_the_type() -> None:
     assert hash_of("sensor_msgs/msg/JointState") == JOINT_HASH
     assert hash_of("rosgraph_msgs/msg/Clock") == CLOCK_HASH
     assert hash_of("std_msgs/msg/String") == TEXT_HASH
+    assert hash_of("nav_msgs/msg/Odometry") == ODOMETRY_HASH
 
 
 def test_an_attachment_tells_the_publisher() -> None:
@@ -181,7 +184,7 @@ async def test_messages_come_from_each_topic_with_any_attachment_or_none() -> No
     clock = SimulatedClock()
     taken: list[Any] = []
     options: RosOptions = {"joint_states": lambda *state: taken.append(state), "robot_description": taken.append}
-    options["clock"] = clock
+    options |= {"clock": clock, "odometry": "/odom"}
     async with router() as address:
         with stranger(address) as session:
             description = zenoh.ext.declare_advanced_publisher(
@@ -200,6 +203,10 @@ async def test_messages_come_from_each_topic_with_any_attachment_or_none() -> No
                 await until(lambda: taken[1:] == [({"a": 0.5}, 5)])
                 (await end.publisher(f"clock/{CLOCK_TYPE}/{CLOCK_HASH}")).put(b"\0\1\0\0" + struct.pack("<iI", 100, 5))
                 await until(lambda: clock.now() == 100_000_000_005)
+                odom = await end.publisher(f"odom/{ODOMETRY_TYPE}/{ODOMETRY_HASH}")
+                odom.put(odometry(moving("odom", "cart", 7, 1.5)))
+                await end.until_heard("cart")
+                assert end.heard.pop() == moving("odom", "cart", 7, 1.5, "/odom")
                 statics = await end.publisher(f"tf_static/{TYPE}/{HASH}")
                 statics.put(encode([moving("map", "lidar", 0)]))
                 await end.until_heard("lidar")
@@ -399,6 +406,7 @@ async def test_no_damaged_message_attachment_or_key_ends_a_link_and_each_is_coun
         f"joint_states/{JOINT_TYPE}/{JOINT_HASH}": [joint_state(5, {"frame": 1.5})],
         f"clock/{CLOCK_TYPE}/{CLOCK_HASH}": [b"\0\1\0\0" + struct.pack("<iI", 5, 6)],
         f"robot_description/{TEXT_TYPE}/{TEXT_HASH}": [TEXT],
+        f"odom/{ODOMETRY_TYPE}/{ODOMETRY_HASH}": [odometry(moving("odom", "frame", 5, 1.5))],
     }
     with Bus(SimulatedClock(), max_ahead=None) as bus:
         bus.subscribe(lambda batch: heard.update(sample.child for sample in batch))
@@ -412,6 +420,7 @@ async def test_no_damaged_message_attachment_or_key_ends_a_link_and_each_is_coun
                 max_frames=10**6,
                 joint_states=lambda *joints: taken.append(joints),
                 robot_description=taken.append,
+                odometry="/odom",
             ) as link,
         ):
             session = await anyio.to_thread.run_sync(zenoh.open, configuration(address, {}))

@@ -1,17 +1,25 @@
 import json
 import struct
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.joint_messages import TYPES
+from support.joint_messages import ODOMETRY, TYPES, odometry
 from support.ros import ros1, ros1_of
 from support.samples import moving
 
 from tfbus import Transform, TransformStamped
-from tfbus.links.ros.messages import as_mapping, decode_clock, decode_mapping, decode_ros1, decode_text
+from tfbus.links.ros.messages import (
+    as_mapping,
+    decode_clock,
+    decode_mapping,
+    decode_odometry,
+    decode_ros1,
+    decode_text,
+)
 from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
 SAMPLES = [
@@ -71,7 +79,7 @@ def test_no_bytes_raise_another_error_than_that_they_are_no_message() -> None:
 
 @given(st.binary(max_size=300))
 def test_garbage_is_a_message_or_malformed(garbage: bytes) -> None:
-    for decode in (decode_ros1, decode_clock, decode_text):
+    for decode in (decode_ros1, decode_clock, decode_text, partial(decode_odometry, ros1=True)):
         for content in (garbage, b"\0\1\0\0" + garbage):
             with suppress(MalformedMessageError):
                 decode(content)
@@ -131,6 +139,22 @@ def test_names_of_a_mapping_are_checked_as_those_of_bytes() -> None:
         decoded = decode_mapping({"transforms": [row]})
         assert decoded.samples == [None]
         assert [error.reason for error in decoded.errors] == ["frame name"]
+
+
+def test_odometry_is_the_transform_of_its_pose_in_every_encoding() -> None:
+    for size in range(8):
+        # Names of all lengths, because the alignment depends on them.
+        sample = TransformStamped("o" * (size + 1), "base", 5_000_000_007, SAMPLES[1].transform)
+        for little_endian in (True, False):
+            assert decode_odometry(odometry(sample, little_endian), ros1=False) == ([sample], [])
+        assert decode_odometry(bytes(TYPES.cdr_to_ros1(odometry(sample), ODOMETRY)), ros1=True) == ([sample], [])
+    row = as_mapping(sample)
+    position, turn = row["transform"]["translation"], row["transform"]["rotation"]
+    message = {**row, "pose": {"pose": {"position": position, "orientation": turn}}}
+    assert decode_odometry(message, ros1=False) == ([sample], [])
+    for content in (odometry(sample)[:60], {}, {**message, "pose": {}}, 5):
+        with pytest.raises(MalformedMessageError):
+            decode_odometry(content, ros1=False)
 
 
 KIND = "rosgraph_msgs/msg/Clock"

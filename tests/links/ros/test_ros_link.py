@@ -3,15 +3,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import pytest
-from support.joint_messages import joint_state
+from support.joint_messages import joint_state, odometry
 from support.processes import until
 from support.ros import ListCarrier, RosEnd, named
 from support.samples import moving, static
 
-from tfbus import Bus, PeerRejected, SimulatedClock, from_seconds
+from tfbus import Bus, PeerRejected, SimulatedClock, Transform, TransformStamped, from_seconds
 from tfbus.links.ros import RosLink, RosOptions
 from tfbus.links.ros.ros_link import MOST_TRANSFORMS, RosMessage
-from tfbus.links.ros.settings import as_topics
+from tfbus.links.ros.settings import Other, as_topics
 from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.anyio
@@ -83,11 +83,11 @@ async def test_a_large_message_is_published_in_parts_up_to_its_first_fault() -> 
     assert [getattr(batch[0], "static", None) for batch in heard] == [False] * 5 + [True] * 4
 
 
-@pytest.mark.parametrize("kind", ["joints", "clock"])
-async def test_a_huge_message_of_joints_or_of_the_time_is_refused(kind: str) -> None:
+@pytest.mark.parametrize("other", ["joints", "clock", "odometry"])
+async def test_a_huge_message_beside_transforms_is_refused(other: Other) -> None:
     taken: list[object] = []
     carrier = ListCarrier({"joint_states": lambda *state: taken.append(state)})
-    content = RosMessage(b"\0\1\0\0" + bytes(2**15), static=False, authority="", **{kind: True})
+    content = RosMessage(b"\0\1\0\0" + bytes(2**15), static=False, authority="", other=other)
     with Bus() as bus:
         async with RosLink(bus, "ros", carrier) as link:
             carrier.hear(content)
@@ -102,7 +102,7 @@ async def test_a_simulated_clock_follows_the_time_of_ros_and_one_jump_back_is_on
 
     def tell(second: int) -> None:
         payload = b"\0\1\0\0" + struct.pack("<iI", second, 5)
-        carrier.hear(RosMessage(payload, static=False, authority="", clock=True), moving=True)
+        carrier.hear(RosMessage(payload, static=False, authority="", other="clock"), moving=True)
 
     with Bus(clock) as bus:
         async with RosLink(bus, "ros", carrier, **options) as link:
@@ -123,6 +123,8 @@ async def test_a_simulated_clock_follows_the_time_of_ros_and_one_jump_back_is_on
         ({"tf_static": []}, ValueError),
         ({"tf": [5]}, TypeError),
         ({"joint_states": print, "joint_topic": "a b"}, ValueError),
+        ({"odometry": "/camera/pose=camera"}, ValueError),
+        ({"odometry": []}, ValueError),
         ({"prefix": "/r"}, ValueError),
         ({"shared": ["map"]}, TypeError),
         ({"capacity": 0}, ValueError),
@@ -305,7 +307,20 @@ def test_positions_of_joints_are_handed_on_and_what_comes_of_that_is_counted() -
 
     end = RosEnd(joint_states=take)
     for payload in (joint_state(5, {"a": 0.5, "b": 1.5}), b"garbage", joint_state(6, {"broken": 1.0})):
-        end.carrier.hear(RosMessage(payload, static=False, authority="", joints=True))
+        end.carrier.hear(RosMessage(payload, static=False, authority="", other="joints"))
     assert taken == [({"a": 0.5, "b": 1.5}, 5), ({"broken": 1.0}, 6)]
     assert end.endpoint.rejected == {"truncated": 1, "not published": 1}
     assert end.heard == []
+
+
+@pytest.mark.parametrize("invert", [False, True])
+def test_odometry_is_a_transform_of_its_topic_and_may_be_inverted(invert: bool) -> None:
+    pose = Transform.from_xyz_rpy((1.0, -2.0, 0.5), (0.1, 0.2, 0.3))
+    end = RosEnd(odometry="/odom", invert=invert, prefix="r/")
+    for payload in (odometry(TransformStamped("odom", "base", 5, pose)), b"garbage"):
+        end.carrier.hear(RosMessage(payload, static=False, authority="/odom", other="odometry"))
+    expected = TransformStamped("r/odom", "r/base", 5, pose, "/odom")
+    if invert:
+        expected = TransformStamped("r/base", "r/odom", 5, pose.inverse(), "/odom")
+    assert end.heard == [(expected,)]
+    assert end.endpoint.rejected == {"truncated": 1}

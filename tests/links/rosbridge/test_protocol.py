@@ -15,7 +15,7 @@ import cbor2
 
 from tfbus.links.ros.messages import as_mapping
 from tfbus.links.rosbridge.protocol import (
-    JOINT_TYPE,
+    OTHER_TYPES,
     advertise,
     decode_content,
     decode_content_in_parts,
@@ -41,7 +41,7 @@ asynchronous = pytest.mark.anyio
             {"op": "subscribe", "type": "tf2_msgs/TFMessage", "queue_length": 0, "compression": "cbor"},
         ),
         (
-            subscribe("/tf", "none", JOINT_TYPE),
+            subscribe("/tf", "none", OTHER_TYPES["joints"]),
             {"op": "subscribe", "type": "sensor_msgs/JointState", "queue_length": 0, "compression": "none"},
         ),
         (unsubscribe("/tf"), {"op": "unsubscribe"}),

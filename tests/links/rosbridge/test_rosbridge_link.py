@@ -12,6 +12,7 @@ import anyio
 import anyio.lowlevel
 import cbor2
 from support.damage import damaged
+from support.joint_messages import ODOMETRY, TYPES, odometry
 from support.processes import until
 from support.rosbridge import install_roslib, joined, rosbridge_server, roslib_client
 from support.samples import moving, static
@@ -198,6 +199,23 @@ async def test_joints_and_the_description_of_a_robot_go_to_who_takes_them(
             await server.say_anything(json.dumps({"op": "publish", "topic": topic, "msg": content}))
         await until(lambda: heard == taken)
         assert link.statistics().rejected == {"encoding": 1}
+
+
+async def test_odometry_comes_as_fields_and_as_bytes_of_either_ros() -> None:
+    moved = [moving("odom", "base", stamp, 1.5, "/odom") for stamp in range(3)]
+    row = as_mapping(moved[0])
+    pose = {"position": row["transform"]["translation"], "orientation": row["transform"]["rotation"]}
+    of_ros2 = [odometry(sample) for sample in moved[1:]]
+    contents = [{**row, "pose": {"pose": pose}}, {"bytes": of_ros2[0]}]
+    contents.append({"bytes": bytes(TYPES.cdr_to_ros1(of_ros2[1], ODOMETRY))})
+    heard: list[Any] = []
+    async with joined(odometry="/odom") as (server, bus, link):
+        bus.subscribe(heard.extend)
+        await until(lambda: "/odom" in server.operations("subscribe"))
+        for content in contents:
+            await server.say_anything(cbor2.dumps({"op": "publish", "topic": "/odom", "msg": content}))
+        await until(lambda: heard == moved)
+        assert link.statistics().rejected == {}
 
 
 @pytest.mark.parametrize(("encoding", "joints"), [("cbor", "none"), ("cbor-raw", "cbor-raw")])

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from tfbus.cli.arguments import Backend, UsageError
+from tfbus.cli.arguments import Backend, Flag, UsageError
 from tfbus.cli.domain import LinkOptions, is_ros
 from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import say
@@ -23,6 +23,8 @@ def bridge(
     *,
     listen: tuple[str, ...] = (),
     connect: Annotated[tuple[str, ...], Parameter(env_var="TFBUS_CONNECT")] = (),
+    odometry: tuple[str, ...] = (),
+    invert: Flag = False,
     backend: Backend = "asyncio",
 ) -> None:
     """Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.
@@ -46,10 +48,22 @@ def bridge(
         Run a router in this program that listens at this address; may be given several times.
     connect
         Connect to the router at this address; may be given several times, for routers that are tried in turn.
+    odometry
+        Pass on the poses of this topic of nav_msgs/Odometry of ROS as transforms, too; may be given several times.
+    invert
+        Make the child of the odometry the parent, because it has a parent already.
     backend
         The event loop to run on.
     """
-    one, other = (_options(place, listen, connect, backend) for place in (first, second))
+    if odometry and not (is_ros(first) or is_ros(second)):
+        raise UsageError(f"--odometry is for ROS, and neither {first!r} nor {second!r} is there")
+    of_ros = LinkOptions(odometry=odometry, invert=invert, backend=backend)
+    one, other = (
+        replace(of_ros, ros=(place,))
+        if is_ros(place)
+        else LinkOptions(place.removeprefix("domain:"), listen, connect, backend=backend)
+        for place in (first, second)
+    )
     names = one.place, other.place
     if one == other:
         if one.ros or not (listen or connect):
@@ -66,12 +80,6 @@ def bridge(
             await anyio.sleep_forever()
 
     other.run(pass_on)
-
-
-def _options(place: str, listen: tuple[str, ...], connect: tuple[str, ...], backend: Backend) -> LinkOptions:
-    if is_ros(place):
-        return LinkOptions(ros=(place,), backend=backend)
-    return LinkOptions(place.removeprefix("domain:"), listen, connect, backend=backend)
 
 
 def _reachable(address: str) -> str:

@@ -80,7 +80,9 @@ def check(
     elif what is not None and link.ros:
         raise UsageError(f"--ros joins ROS in place of a domain: leave {what!r} out")
     else:
-        findings = _check_domain(link if what is None else replace(link, domain=what), limits, duration)
+        domain = link.domain if what is None else what
+        link = replace(link, domain=domain, odometry=topics.odometry, invert=topics.invert)
+        findings = _check_domain(link, limits, duration)
     if as_json:
         print(json.dumps([{**asdict(finding), "advice": finding.advice} for finding in findings], indent=2))
     else:

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError, is_number, usage_errors
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups
+from tfbus.cli.domain import DEFAULT_HEARING, HearingOptions, RemoteLookups
 from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import cells, print_now, say, terminal_width, wrapped
 
@@ -38,7 +38,7 @@ def echo(
     max_age: Duration = math.inf,
     as_json: JsonFlag = False,
     remote: Flag = False,
-    link: LinkOptions = DEFAULT_LINK,
+    link: HearingOptions = DEFAULT_HEARING,
 ) -> None:
     """Print the transform of SOURCE in TARGET again and again, until Ctrl-C.
 

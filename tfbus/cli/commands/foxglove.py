@@ -1,15 +1,7 @@
 """``tfbus foxglove``."""
 
-from tfbus.cli.arguments import Port, UsageError, usage_errors
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.lazy_imports import lazy_imports
-from tfbus.cli.output import print_now, say
-
-with lazy_imports():
-    import anyio
-
-    from tfbus._aio.web_door import WebDoor
-    from tfbus.bus.bus import Bus
+from tfbus.cli.arguments import Port, usage_errors
+from tfbus.cli.domain import DEFAULT_HEARING, HearingOptions
 
 
 def foxglove(
@@ -17,7 +9,7 @@ def foxglove(
     port: Port = 8765,
     host: str = "127.0.0.1",
     origin: tuple[str, ...] = (),
-    link: LinkOptions = DEFAULT_LINK,
+    link: HearingOptions = DEFAULT_HEARING,
 ) -> None:
     """Show the frames of a domain to the Foxglove application, until Ctrl-C.
 
@@ -38,19 +30,7 @@ def foxglove(
     with usage_errors():
         from tfbus.links.foxglove import APPLICATION, FoxgloveServer
 
-        WebDoor(host, origin)
-
-    async def serve(bus: Bus) -> None:
-        server = FoxgloveServer(bus, port, host=host, origins=(*APPLICATION, *origin))
-        try:
-            await server.__aenter__()
-        except OSError as error:
-            raise UsageError(str(error)) from None
-        try:
-            print_now(server.address)
-            say("open this address in Foxglove (Open connection, Foxglove WebSocket); Ctrl-C ends it")
-            await anyio.sleep_forever()
-        finally:
-            await server.__aexit__(None, None, None)
-
-    link.run(serve)
+    link.serve(
+        lambda bus: FoxgloveServer(bus, port, host=host, origins=(*APPLICATION, *origin)),
+        "open this address in Foxglove (Open connection, Foxglove WebSocket); Ctrl-C ends it",
+    )

@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Positive, Rate, UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.domain import DEFAULT_HEARING, HearingOptions
 from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import Column, format_span, print_now, table_lines, terminal_width, wrapped
 
@@ -81,7 +81,7 @@ def monitor(
     once: Flag = False,
     duration: Duration = 3.0,
     as_json: JsonFlag = False,
-    link: LinkOptions = DEFAULT_LINK,
+    link: HearingOptions = DEFAULT_HEARING,
 ) -> None:
     """Measure the rate, the delay, the jitter and the losses of each frame and sender of a domain, until Ctrl-C.
 

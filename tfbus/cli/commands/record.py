@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, AsyncExitStack
 from pathlib import Path
 
 from tfbus.cli.arguments import Duration, Flag, UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.domain import DEFAULT_HEARING, HearingOptions
 from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import format_counts, say, warn
 from tfbus.cli.statuses import ENDED_BY_SIGNAL, FAILED
@@ -30,7 +30,7 @@ def record(
     *,
     duration: Duration = math.inf,
     overwrite: Flag = False,
-    link: LinkOptions = DEFAULT_LINK,
+    link: HearingOptions = DEFAULT_HEARING,
 ) -> int:
     """Record all transforms of a domain to FILE, in MCAP as ROS 2 and Foxglove read it, until Ctrl-C.
 
@@ -84,7 +84,7 @@ def _open_signals() -> AbstractContextManager[AsyncIterator[signal.Signals]]:
 
 async def _wait_for_end(
     bus: Bus,
-    link: LinkOptions,
+    link: HearingOptions,
     duration: float,
     events: EventStream,
     signals: AsyncIterator[signal.Signals] | None,

@@ -3,6 +3,7 @@
 import json
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,7 @@ def tree(
                     say(remark)
                 link.print_peers(links)
 
+    link = replace(link, odometry=topics.odometry, invert=topics.invert)
     link.run(show_tree, clock=ReplayClock(), links=links)
 
 

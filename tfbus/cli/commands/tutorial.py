@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 
 from tfbus.cli.arguments import Backend, Duration, Flag, Rate
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, run
+from tfbus.cli.domain import DEFAULT_HEARING, DEFAULT_LINK, HearingOptions, LinkOptions, run
 from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import fitted, print_now, say
 
@@ -52,7 +52,7 @@ def broadcast(*, rate: Rate = 100.0, link: LinkOptions = DEFAULT_LINK) -> None:
     link.run(broadcast_laser)
 
 
-def listen(*, rate: Rate = 1.0, link: LinkOptions = DEFAULT_LINK) -> None:
+def listen(*, rate: Rate = 1.0, link: HearingOptions = DEFAULT_HEARING) -> None:
     """Print a point of the tutorial's laser in the frame of the base, again and again, until Ctrl-C.
 
     Start `tfbus broadcast` in another terminal, before or after. Without it, the lines say what is missing.

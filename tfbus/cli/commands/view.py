@@ -5,7 +5,7 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 
 from tfbus.cli.arguments import Port, Rate, UsageError, usage_errors
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, run
+from tfbus.cli.domain import DEFAULT_HEARING, HearingOptions, run
 from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import format_counts, print_now, say, warn
 from tfbus.cli.recordings import load_tree
@@ -37,7 +37,7 @@ def view(
     host: str = "127.0.0.1",
     origin: tuple[str, ...] = (),
     rate: Rate = 30.0,
-    link: LinkOptions = DEFAULT_LINK,
+    link: HearingOptions = DEFAULT_HEARING,
 ) -> None:
     """Show the frames of a domain, or of a recording, as a live 3D page in the browser, until Ctrl-C.
 

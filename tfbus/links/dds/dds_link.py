@@ -56,11 +56,12 @@ from tfbus.links.dds.types import (
     RawClock,
     RawEntitiesInfo,
     RawJointState,
+    RawOdometry,
     RawString,
     RawTFMessage,
 )
 from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
-from tfbus.links.ros.settings import RosOptions, RosSettings, as_domain, settings_of
+from tfbus.links.ros.settings import Other, RosOptions, RosSettings, as_domain, settings_of
 from tfbus.links.seams import Joined, Left, Received
 from tfbus.tf_message import MalformedMessageError, encode
 
@@ -162,6 +163,12 @@ _KEPT = 100
 _NODES = "ros_discovery_info"
 _OTHERS = "other topics"
 """The authority of joint positions and of the time."""
+_TYPES: dict[Other, Any] = {
+    "joints": RawJointState,
+    "clock": RawClock,
+    "description": RawString,
+    "odometry": RawOdometry,
+}
 _AT_ONCE = 16
 _BYTES_AT_ONCE = 2**20
 _BATCHES = 10
@@ -240,16 +247,12 @@ class DdsCarrier(RosCarrier):
                 self._open.callback(delete, self._participants)
                 info = Topic(participant, _NODES, RawEntitiesInfo)
                 thread.watch(self._reader(participant, info, _STATICS), self._take_nodes)
-            for name in self.settings.joint_topic:
-                joints = Topic(participant, f"rt{name}", RawJointState)
-                thread.watch(self._reader(participant, joints, _ANY), partial(self._take_other, "joints"))
-            for name in self.settings.clock_topic:
-                clock = Topic(participant, f"rt{name}", RawClock)
-                thread.watch(self._reader(participant, clock, _ANY), partial(self._take_other, "clock"))
-            for name in self.settings.description_topic:
-                # Latched, as static frames are.
-                text = Topic(participant, f"rt{name}", RawString)
-                thread.watch(self._reader(participant, text, _STATICS), partial(self._take_other, "description"))
+            for other, names in self.settings.others.items():
+                for name in names:
+                    topic = Topic(participant, f"rt{name}", _TYPES[other])
+                    # A description is latched, as static frames are.
+                    reader = self._reader(participant, topic, _STATICS if other == "description" else _ANY)
+                    thread.watch(reader, partial(self._take_other, other, name))
             for number, name in enumerate((*self.settings.tf_static, *self.settings.tf)):
                 static = number < len(self.settings.tf_static)
                 reader = self._reader(participant, topics[name], _STATICS if static else _HEARD)
@@ -397,12 +400,11 @@ class DdsCarrier(RosCarrier):
         else:
             self._publishers.nodes(participant, nodes)
 
-    def _take_other(self, kind: Literal["joints", "clock", "description"], reader: DataReader[Any]) -> bool:
-        return self._take_each(reader, partial(self._pass_other, kind))
+    def _take_other(self, other: Other, topic: str, reader: DataReader[Any]) -> bool:
+        return self._take_each(reader, partial(self._pass_other, other, topic))
 
-    def _pass_other(self, kind: Literal["joints", "clock", "description"], message: Any) -> None:
-        other = {kind: True}
-        self._pass_on(_OTHERS, RosMessage(message.payload, static=False, authority="", **other))
+    def _pass_other(self, other: Other, topic: str, message: Any) -> None:
+        self._pass_on(_OTHERS, RosMessage(message.payload, False, topic, other))
 
     def _match(self, number: int, reader: DataReader[RawTFMessage]) -> float | None:
         try:

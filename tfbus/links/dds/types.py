@@ -6,7 +6,7 @@ that are declared here are for others, to whom DDS tells the type.
 
 import struct
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from cyclonedds.core import Entity
 from cyclonedds.idl import IdlStruct
@@ -99,6 +99,78 @@ class RawTFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
         return cls.of(b"")
 
 
+T = TypeVar("T")
+
+
+def staying_bytes(kind: type[T]) -> type[T]:
+    """Have the messages of a type become their bytes, `payload`, when they come."""
+
+    def of(data: bytes, *_: Any, **__: Any) -> T:
+        message: Any = kind.__new__(kind)
+        message.payload = bytes(data)
+        made: T = message
+        return made
+
+    # The type has no key: there is one message without any bytes, for a writer that has gone.
+    for name, read in (("deserialize", of), ("deserialize_key", lambda *_, **__: of(b""))):
+        setattr(kind, name, staticmethod(read))
+    return kind
+
+
+@dataclass
+class Point(IdlStruct, typename="geometry_msgs::msg::dds_::Point_"):
+    """``geometry_msgs/msg/Point``."""
+
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
+class Pose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
+    """``geometry_msgs/msg/Pose``."""
+
+    position: Point
+    orientation: Quaternion
+
+
+@dataclass
+class PoseWithCovariance(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovariance_"):
+    """``geometry_msgs/msg/PoseWithCovariance``."""
+
+    pose: Pose
+    covariance: array[float64, 36]
+
+
+@dataclass
+class Twist(IdlStruct, typename="geometry_msgs::msg::dds_::Twist_"):
+    """``geometry_msgs/msg/Twist``."""
+
+    linear: Vector3
+    angular: Vector3
+
+
+@dataclass
+class TwistWithCovariance(IdlStruct, typename="geometry_msgs::msg::dds_::TwistWithCovariance_"):
+    """``geometry_msgs/msg/TwistWithCovariance``."""
+
+    twist: Twist
+    covariance: array[float64, 36]
+
+
+@staying_bytes
+@dataclass
+class RawOdometry(IdlStruct, typename="nav_msgs::msg::dds_::Odometry_"):
+    """``nav_msgs/msg/Odometry``, which becomes its bytes when it comes."""
+
+    header: Header
+    child_frame_id: str
+    pose: PoseWithCovariance
+    twist: TwistWithCovariance
+    payload = b""
+
+
+@staying_bytes
 @dataclass
 class RawJointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
     """``sensor_msgs/msg/JointState``, which becomes its bytes when it comes."""
@@ -110,19 +182,8 @@ class RawJointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
     effort: sequence[float64]
     payload = b""
 
-    @classmethod
-    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Self:
-        """The message of the bytes that have come."""
-        message = cls.__new__(cls)
-        message.payload = bytes(data)
-        return message
 
-    @classmethod
-    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
-        """An empty message, for a writer that has gone."""
-        return cls.deserialize(b"")
-
-
+@staying_bytes
 @dataclass
 class RawClock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
     """``rosgraph_msgs/msg/Clock``, which becomes its bytes when it comes."""
@@ -130,37 +191,14 @@ class RawClock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
     clock: Time
     payload = b""
 
-    @classmethod
-    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Self:
-        """The message of the bytes that have come."""
-        message = cls.__new__(cls)
-        message.payload = bytes(data)
-        return message
 
-    @classmethod
-    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
-        """An empty message, for a writer that has gone."""
-        return cls.deserialize(b"")
-
-
+@staying_bytes
 @dataclass
 class RawString(IdlStruct, typename="std_msgs::msg::dds_::String_"):
     """``std_msgs/msg/String``, which becomes its bytes when it comes."""
 
     data: str
     payload = b""
-
-    @classmethod
-    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Self:
-        """The message of the bytes that have come."""
-        message = cls.__new__(cls)
-        message.payload = bytes(data)
-        return message
-
-    @classmethod
-    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
-        """An empty message, for a writer that has gone."""
-        return cls.deserialize(b"")
 
 
 @dataclass
@@ -194,6 +232,7 @@ class ParticipantEntitiesInfo(IdlStruct, typename="rmw_dds_common::msg::dds_::Pa
     node_entities_info_seq: sequence[NodeEntitiesInfo]
 
 
+@staying_bytes
 @dataclass
 class RawEntitiesInfo(IdlStruct, typename="rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"):
     """`ParticipantEntitiesInfo`, which stays bytes when it comes, so that one that cannot be read spoils no others."""
@@ -201,18 +240,6 @@ class RawEntitiesInfo(IdlStruct, typename="rmw_dds_common::msg::dds_::Participan
     gid: Gid
     node_entities_info_seq: sequence[NodeEntitiesInfo]
     payload = b""
-
-    @classmethod
-    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Self:
-        """The message of the bytes that have come."""
-        message = cls.__new__(cls)
-        message.payload = bytes(data)
-        return message
-
-    @classmethod
-    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
-        """An empty message, for a writer that has gone."""
-        return cls.deserialize(b"")
 
     def read(self) -> tuple[str, list[tuple[str, list[str]]]]:
         """The id of the participant, and its nodes, each with its publishers.

@@ -17,7 +17,7 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from time import time_ns
-from typing import Any, Final, Literal, NamedTuple, Unpack
+from typing import Any, Final, NamedTuple, Unpack
 from uuid import uuid4
 
 import anyio
@@ -28,7 +28,7 @@ import zenoh.ext
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.ros.ros_link import RosCarrier, RosLink, RosMessage
-from tfbus.links.ros.settings import RosOptions, RosSettings, as_domain, settings_of
+from tfbus.links.ros.settings import Other, RosOptions, RosSettings, as_domain, settings_of
 from tfbus.links.seams import Received
 from tfbus.links.zenoh.sessions import (
     begin_to_close,
@@ -51,6 +51,15 @@ CLOCK_HASH: Final = "RIHS01_692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e480
 TEXT_TYPE: Final = "std_msgs::msg::dds_::String_"
 TEXT_HASH: Final = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 """Of ``std_msgs/msg/String``."""
+ODOMETRY_TYPE: Final = "nav_msgs::msg::dds_::Odometry_"
+ODOMETRY_HASH: Final = "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"
+"""Of ``nav_msgs/msg/Odometry``."""
+OTHER_TYPES: Final[dict[Other, tuple[str, str]]] = {
+    "joints": (JOINT_TYPE, JOINT_HASH),
+    "clock": (CLOCK_TYPE, CLOCK_HASH),
+    "description": (TEXT_TYPE, TEXT_HASH),
+    "odometry": (ODOMETRY_TYPE, ODOMETRY_HASH),
+}
 NODE_ID: Final = 0
 
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -115,7 +124,6 @@ def other_token(
 
 _HEARTBEAT = 0.5
 _AUTHORITY = "rmw_zenoh"
-_Other = Literal["joints", "clock", "description"]
 
 
 class RmwZenohCarrier(RosCarrier):
@@ -170,15 +178,11 @@ class RmwZenohCarrier(RosCarrier):
                 self._declared.append(self._subscriber(session, key, static, partial(self._take, static)))
             self._token(endpoint_token(self._domain, name, number, self._node, topic, static, publishes))
 
-        others: tuple[tuple[_Other, str, str, str], ...] = (
-            *(("joints", topic, JOINT_TYPE, JOINT_HASH) for topic in self.settings.joint_topic),
-            *(("clock", topic, CLOCK_TYPE, CLOCK_HASH) for topic in self.settings.clock_topic),
-            *(("description", topic, TEXT_TYPE, TEXT_HASH) for topic in self.settings.description_topic),
-        )
-        for number, (content, topic, kind, digest) in enumerate(others, len(topics) + 1):
-            latched = content == "description"
+        others = [(other, topic) for other, names in self.settings.others.items() for topic in names]
+        for number, (other, topic) in enumerate(others, len(topics) + 1):
+            latched, (kind, digest) = other == "description", OTHER_TYPES[other]
             key = topic_expression(self._domain, topic, kind)
-            self._declared.append(self._subscriber(session, key, latched, partial(self._take_other, content)))
+            self._declared.append(self._subscriber(session, key, latched, partial(self._take_other, other, topic)))
             self._token(other_token(self._domain, name, number, self._node, topic, kind, digest, latched))
 
     def _token(self, key: str) -> None:
@@ -261,10 +265,9 @@ class RmwZenohCarrier(RosCarrier):
             return
         self._pass_on(_AUTHORITY, RosMessage(bytes(sample.payload), static, _AUTHORITY))
 
-    def _take_other(self, content: _Other, sample: zenoh.Sample) -> None:
-        """Take positions of joints, the time, or the description of a robot, in zenoh's threads."""
-        other = {content: True}
-        self._pass_on(_AUTHORITY, RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, **other))
+    def _take_other(self, other: Other, topic: str, sample: zenoh.Sample) -> None:
+        """Take a message of another topic, in zenoh's threads."""
+        self._pass_on(_AUTHORITY, RosMessage(bytes(sample.payload), False, topic, other))
 
 
 _NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")

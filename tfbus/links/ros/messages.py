@@ -18,7 +18,7 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
 from tfbus.links.replica import ReceivedTransform
 from tfbus.stamps import SECOND
-from tfbus.tf_message import MAX_NAME, Decoded, MalformedMessageError
+from tfbus.tf_message import MAX_NAME, Decoded, FieldReader, MalformedMessageError
 
 _COUNT = struct.Struct("<I")
 _HEAD = struct.Struct("<4xII")
@@ -56,6 +56,30 @@ def decode_mapping(message: object) -> Decoded[ReceivedTransform]:
         return _decoded(_parts_of_mapping(message))
     except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise MalformedMessageError("encoding", f"it has not the fields of a TFMessage: {error!r}"[:200]) from None
+
+
+def decode_odometry(content: object, ros1: bool) -> Decoded[ReceivedTransform]:
+    """The transform of a ``nav_msgs/Odometry``, in bytes or as a mapping: its pose, from its frame to its child.
+
+    Raises
+    ------
+    MalformedMessageError
+        If it is no such message.
+    """
+    try:
+        if isinstance(content, bytes):
+            fields = FieldReader(content, ros1)
+            stamp, parent = fields.header()
+            child, numbers = fields.text(), fields.doubles(7)
+            return _decoded([(_text(parent), _text(child), stamp // SECOND, stamp % SECOND, numbers)])
+        message: Any = content
+        pose = message["pose"]["pose"]
+        transform = {"translation": pose["position"], "rotation": pose["orientation"]}
+        return _decoded(_parts_of_mapping({"transforms": [{**message, "transform": transform}]}))
+    except struct.error:
+        raise MalformedMessageError("truncated", "it ends before the pose does") from None
+    except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise MalformedMessageError("encoding", f"it has not the fields of an Odometry: {error!r}"[:200]) from None
 
 
 def decode_ros1_in_parts(payload: bytes, most: int) -> Iterator[Decoded[ReceivedTransform]]:

@@ -19,8 +19,8 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.link import Link
 from tfbus.links.replica import OutgoingBatch, ReceivedTransform
 from tfbus.links.ros.foreign_end import Carrier, ForeignEnd, ReceivedMessage, Turn
-from tfbus.links.ros.messages import decode_clock, decode_text
-from tfbus.links.ros.settings import RosOptions, RosSettings
+from tfbus.links.ros.messages import decode_clock, decode_odometry, decode_text
+from tfbus.links.ros.settings import Other, RosOptions, RosSettings
 from tfbus.links.seams import Received, SendReport
 from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, MalformedMessageError, decode, decode_in_parts, refusal
@@ -49,8 +49,8 @@ class RosMessage:
         Whether the topic is one of static frames.
     authority : str
         The node that has published it, or what is known of it.
-    joints, clock, description : bool
-        Whether it has positions of joints, the time, or the URDF of a robot, rather than transforms.
+    other : str
+        Its content, see `Other`; None for transforms.
     continues : bool
         Whether it is a later part of a large message.
     """
@@ -58,15 +58,8 @@ class RosMessage:
     payload: Any
     static: bool
     authority: str
-    joints: bool = False
-    clock: bool = False
-    description: bool = False
+    other: Other | None = None
     continues: bool = False
-
-    @property
-    def has_transforms(self) -> bool:
-        """Whether it has transforms."""
-        return not (self.joints or self.clock or self.description)
 
 
 class RosCarrier(Carrier, ABC):
@@ -117,7 +110,7 @@ class RosCarrier(Carrier, ABC):
 
     def split(self, content: Any) -> Iterator[Any]:
         """The parts of a large message of transforms, each of `PART` of them; anything else is its only part."""
-        if not isinstance(content, RosMessage) or not content.has_transforms or not self._is_large(content.payload):
+        if not isinstance(content, RosMessage) or content.other or not self._is_large(content.payload):
             yield content
             return
         continues = False
@@ -127,23 +120,28 @@ class RosCarrier(Carrier, ABC):
 
     def read(self, content: RosMessage) -> ReceivedMessage:
         """The samples of a message by their names on the bus, or the time; positions of joints are handed on."""
-        if (content.clock or content.joints) and isinstance(content.payload, bytes):
+        if content.other not in (None, "description") and isinstance(content.payload, bytes):
             size = len(content.payload)
             if size > MAX_OTHER_SIZE:
                 raise MalformedMessageError("oversized", f"{size} bytes, more than {MAX_OTHER_SIZE}")
-        if content.clock:
+        if content.other == "clock":
             return ReceivedMessage([], time=decode_clock(content.payload))
-        if content.joints:
+        if content.other == "joints":
             stamp, positions = self._decode_joints(content.payload)
             if self.settings.joint_states is not None:
                 self.settings.joint_states(positions, stamp + self.settings.names.offset)
             return ReceivedMessage([])
-        if content.description:
+        if content.other == "description":
             description = decode_text(content.payload)
             if self.settings.robot_description is not None:
                 self.settings.robot_description(description)
             return ReceivedMessage([])
-        decoded = content.payload if isinstance(content.payload, Decoded) else self._decode(content.payload)
+        if content.other == "odometry":
+            decoded = self._decode_odometry(content.payload)
+            if self.settings.invert:
+                decoded.samples[:] = [sample and _inverse(sample) for sample in decoded.samples]
+        else:
+            decoded = content.payload if isinstance(content.payload, Decoded) else self._decode(content.payload)
         self._heard(decoded.samples, content.static)
         errors = decoded.errors
         samples: list[ReceivedTransform] = []
@@ -196,6 +194,10 @@ class RosCarrier(Carrier, ABC):
         """The stamp and the positions of joints of a message; raises `MalformedMessageError`."""
         return decode_joint_state(payload, ros1=False)
 
+    def _decode_odometry(self, payload: Any) -> Decoded[ReceivedTransform]:
+        """The transform of odometry; raises `MalformedMessageError`."""
+        return decode_odometry(payload, ros1=False)
+
     def _pass_on(self, sender: str, message: RosMessage) -> None:
         """Hand a message of bytes to the link, or the refusal of one that is too large; any thread may call this."""
         size = len(message.payload)
@@ -204,7 +206,7 @@ class RosCarrier(Carrier, ABC):
             self._receive(Received(sender, error))
         else:
             # A latched message comes once.
-            moving = not (message.static or message.description)
+            moving = not (message.static or message.other == "description")
             self._receive(Received(sender, message, size, moving=moving))
 
     def publish_statics(self) -> None:
@@ -228,6 +230,10 @@ class RosCarrier(Carrier, ABC):
                 error = no_name.with_traceback(None)
         self._report.refused(error.reason, error)
         return None
+
+
+def _inverse(sample: ReceivedTransform) -> ReceivedTransform:
+    return ReceivedTransform(sample.child, sample.parent, sample.stamp, sample.transform.inverse())
 
 
 class RosLink(Link):
@@ -264,6 +270,11 @@ class RosLink(Link):
         An error that it raises is counted in `LinkStatistics.rejected`.
     description_topic : str
         The topic of that, by default ``/robot_description``.
+    odometry : str or iterable of str, optional
+        Topics of ``nav_msgs/Odometry``: the pose of each message is a moving transform, from its frame to its child,
+        with the topic as its authority.
+    invert : bool
+        Whether the child of odometry becomes the parent, because it has a parent already.
     clock : SimulatedClock, optional
         Follows ``/clock``, the time of a simulation: it advances, and jumps where that time jumps; one jump back is one
         reset. Give the clock of the bus.

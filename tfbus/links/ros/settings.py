@@ -8,8 +8,8 @@ undoes both.
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from typing import TypedDict
+from dataclasses import dataclass, field
+from typing import Literal, TypedDict
 
 from tfbus.clock import SimulatedClock
 from tfbus.errors import InvalidTransformError
@@ -122,6 +122,9 @@ class FrameNames:
 
 _LAST_DOMAIN = 232
 
+Other = Literal["joints", "clock", "description", "odometry"]
+"""The topics beside those of transforms: positions of joints, the time, the URDF of a robot, and odometry."""
+
 JointStates = Callable[[Mapping[str, float], int], object]
 """Takes the positions of joints by their names, in rad or m, and the stamp in ns."""
 
@@ -144,6 +147,8 @@ class RosOptions(TypedDict, total=False):
     joint_topic: str
     robot_description: TakesDescription | None
     description_topic: str
+    odometry: str | Iterable[str]
+    invert: bool
     clock: SimulatedClock | HearsTime | None
     drop_lost: bool
     max_frames: int
@@ -166,14 +171,12 @@ class RosSettings:
         The authority of all samples that come in; None for the node that has published them, where it is known.
     joint_states : callable or None
         Takes the positions of joints that come in.
-    joint_topic : tuple of str
-        The topic of these, if somebody takes them.
     robot_description : callable or None
         Takes the URDF of the robot.
-    description_topic : tuple of str
-        The topic of that, if somebody takes it.
-    clock_topic : tuple of str
-        The topic of the time, if a clock follows it.
+    invert : bool
+        Whether the child of odometry becomes the parent.
+    others : dict of str to tuple of str
+        The other topics that somebody takes, by what they have.
     """
 
     tf: tuple[str, ...] = ("/tf",)
@@ -182,10 +185,9 @@ class RosSettings:
     send: bool = True
     authority: str | None = None
     joint_states: JointStates | None = None
-    joint_topic: tuple[str, ...] = ()
-    clock_topic: tuple[str, ...] = ()
     robot_description: TakesDescription | None = None
-    description_topic: tuple[str, ...] = ()
+    invert: bool = False
+    others: dict[Other, tuple[str, ...]] = field(default_factory=dict)
 
 
 def settings_of(options: RosOptions) -> RosSettings:
@@ -205,6 +207,15 @@ def settings_of(options: RosOptions) -> RosSettings:
     description = options.get("robot_description")
     if description is not None and not callable(description):
         raise TypeError(f"robot_description must be callable, not {description!r}")
+    others: dict[Other, tuple[str, ...]] = {}
+    if joint_states is not None:
+        others["joints"] = as_topics(options.get("joint_topic", "/joint_states"), "joint_topic")
+    if options.get("clock") is not None:
+        others["clock"] = ("/clock",)
+    if description is not None:
+        others["description"] = as_topics(options.get("description_topic", "/robot_description"), "description_topic")
+    if "odometry" in options:
+        others["odometry"] = as_topics(options["odometry"], "odometry")
     return RosSettings(
         as_topics(options.get("tf", "/tf"), "tf"),
         as_topics(options.get("tf_static", "/tf_static"), "tf_static"),
@@ -212,12 +223,9 @@ def settings_of(options: RosOptions) -> RosSettings:
         bool(options.get("send", True)),
         authority,
         joint_states,
-        () if joint_states is None else as_topics(options.get("joint_topic", "/joint_states"), "joint_topic"),
-        () if options.get("clock") is None else ("/clock",),
         description,
-        ()
-        if description is None
-        else as_topics(options.get("description_topic", "/robot_description"), "description_topic"),
+        bool(options.get("invert", False)),
+        others,
     )
 
 

@@ -14,22 +14,33 @@ import json
 import re
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from io import BytesIO
-from typing import Any, Final, NamedTuple, NoReturn
+from typing import Any, Final, NamedTuple, NoReturn, TypeVar
 
 import cbor2
 
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.replica import ReceivedTransform
-from tfbus.links.ros.messages import as_mapping, decode_mapping, decode_ros1, decode_ros1_in_parts, stamp_of
+from tfbus.links.ros.messages import (
+    as_mapping,
+    decode_mapping,
+    decode_odometry,
+    decode_ros1,
+    decode_ros1_in_parts,
+    stamp_of,
+)
 from tfbus.links.ros.ros_link import AT_ONCE, MAX_SIZE, PART
+from tfbus.links.ros.settings import Other
 from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, MalformedMessageError, decode, decode_in_parts
 
 TYPE: Final = "tf2_msgs/TFMessage"
 """ROS 2 takes this name too."""
-JOINT_TYPE: Final = "sensor_msgs/JointState"
-CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
-TEXT_TYPE: Final = "std_msgs/String"
+OTHER_TYPES: Final[dict[Other, str]] = {
+    "joints": "sensor_msgs/JointState",
+    "clock": "rosgraph_msgs/Clock",
+    "description": "std_msgs/String",
+    "odometry": "nav_msgs/Odometry",
+}
 QUEUE: Final = 100
 _CDR: Final = b"\0\1\0\0"
 _DOUBLES: Final = 86
@@ -423,6 +434,25 @@ def is_of_ros2(content: Any) -> bool:
         return False
 
 
+T = TypeVar("T")
+
+
+def _of_either(content: bytes, decode_bytes: Callable[[bytes, bool], T]) -> T:
+    """Decode bytes of either ROS."""
+    if content.startswith(_CDR):
+        try:
+            return decode_bytes(content, False)
+        except MalformedMessageError:
+            # The message with the number 256 of ROS 1 begins like that.
+            return decode_bytes(content, True)
+    return decode_bytes(content, True)
+
+
+def decode_odometry_of(content: Any) -> Decoded[ReceivedTransform]:
+    """The transform of odometry, in bytes of either ROS or as a mapping; raises `MalformedMessageError`."""
+    return _of_either(content, decode_odometry) if isinstance(content, bytes) else decode_odometry(content, ros1=False)
+
+
 def decode_joints(content: Any) -> tuple[int, dict[str, float]]:
     """The stamp and the positions of joints of a message, in bytes of either ROS or as a mapping.
 
@@ -432,13 +462,7 @@ def decode_joints(content: Any) -> tuple[int, dict[str, float]]:
         If it holds none.
     """
     if isinstance(content, bytes):
-        if content.startswith(_CDR):
-            try:
-                return decode_joint_state(content, ros1=False)
-            except MalformedMessageError:
-                # The message with the number 256 of ROS 1 begins like that.
-                return decode_joint_state(content, ros1=True)
-        return decode_joint_state(content, ros1=True)
+        return _of_either(content, decode_joint_state)
     try:
         stamp, names, positions = stamp_of(content["header"]["stamp"]), content["name"], content["position"]
         if isinstance(positions, cbor2.CBORTag) and positions.tag == _DOUBLES:

@@ -40,15 +40,14 @@ from tfbus.links.replica import ReceivedTransform
 from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, settings_of
 from tfbus.links.rosbridge.protocol import (
-    CLOCK_TYPE,
-    JOINT_TYPE,
-    TEXT_TYPE,
+    OTHER_TYPES,
     Incoming,
     LargeMessage,
     advertise,
     decode_content,
     decode_content_in_parts,
     decode_joints,
+    decode_odometry_of,
     is_large,
     is_of_ros2,
     publish,
@@ -201,13 +200,11 @@ class RosbridgeCarrier(RosCarrier):
         # First of all: what is latched may come only once, and moving frames come again.
         for topic in (*self.settings.tf_static, *self.settings.tf):
             self._request(subscribe(topic, self._encoding))
-        for topic in self.settings.joint_topic:
+        for other, topics in self.settings.others.items():
             # In CBOR, a server of ROS 1 fails at the names of the joints, an array of strings.
-            self._request(subscribe(topic, "none" if self._encoding == "cbor" else self._encoding, JOINT_TYPE))
-        for topic in self.settings.clock_topic:
-            self._request(subscribe(topic, self._encoding, CLOCK_TYPE))
-        for topic in self.settings.description_topic:
-            self._request(subscribe(topic, self._encoding, TEXT_TYPE))
+            plain = other == "joints" and self._encoding == "cbor"
+            for topic in topics:
+                self._request(subscribe(topic, "none" if plain else self._encoding, OTHER_TYPES[other]))
         if self.settings.send:
             self._request(advertise(self.settings.tf_static[0], static=True))
             self.publish_statics()
@@ -276,6 +273,9 @@ class RosbridgeCarrier(RosCarrier):
     def _decode_joints(self, payload: Any) -> tuple[int, dict[str, float]]:
         return decode_joints(payload)
 
+    def _decode_odometry(self, payload: Any) -> Decoded[ReceivedTransform]:
+        return decode_odometry_of(payload)
+
     async def _talk(self, socket: WebSocket) -> None:
         """Send and receive until the server is gone."""
         # A message that is being sent when the link ends goes out whole, or later ones could not be read.
@@ -334,16 +334,11 @@ class RosbridgeCarrier(RosCarrier):
                 said = incoming.content.encode("unicode_escape").decode()
                 self._report.failed(ConnectionError(f"{self.url} says: {said}"))
             return
-        others = {
-            "joints": self.settings.joint_topic,
-            "clock": self.settings.clock_topic,
-            "description": self.settings.description_topic,
-        }
-        for kind, topics in others.items():
+        for other, topics in self.settings.others.items():
             if incoming.topic in topics:
-                other = RosMessage(incoming.content, static=False, authority="", **{kind: True})
+                message = RosMessage(incoming.content, False, incoming.topic, other)
                 # A latched message comes once.
-                self._receive(Received(self.url, other, size, moving=kind != "description"))
+                self._receive(Received(self.url, message, size, moving=other != "description"))
                 return
         static = incoming.topic in self.settings.tf_static
         if not static and incoming.topic not in self.settings.tf:

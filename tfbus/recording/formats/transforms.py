@@ -313,6 +313,13 @@ def _raw(seconds: int, nanoseconds: int, parent: str, child: str, numbers: Seque
     return RawTransform(seconds, nanoseconds, parent.encode(), child.encode(), _NUMBERS.pack(*numbers))
 
 
+def _inverted(sample: TransformStamped | None) -> TransformStamped | None:
+    if sample is None:
+        return None
+    transform = sample.transform.inverse()
+    return TransformStamped(sample.child, sample.parent, sample.stamp, transform, sample.authority, sample.static)
+
+
 Run = tuple[str, int]
 """An authority, and the number of successive transforms that it sent."""
 
@@ -385,7 +392,7 @@ class ChannelDecoder:
             belief = Belief(covariance, "drift" if self.channel.type in _ODOMETRY else "independent")
             decoded.samples[:] = [sample and with_belief(sample, belief) for sample in decoded.samples]
         if self._invert:
-            decoded.samples[:] = [sample and ~sample for sample in decoded.samples]
+            decoded.samples[:] = map(_inverted, decoded.samples)
         return decoded
 
     def _covariance(self, payload: bytes) -> Covariance | None:

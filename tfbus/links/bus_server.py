@@ -1,0 +1,73 @@
+"""`BusServer`, what the servers that show a bus to web pages have in common: one address, and a door."""
+
+from collections.abc import Iterable
+from types import TracebackType
+from typing import Self
+
+from tfbus._aio.web_door import WebDoor
+from tfbus._aio.web_server import Answer, WebServer
+from tfbus.bus.bus import Bus
+from tfbus.errors import BusClosedError
+from tfbus.registration import AsyncOnly, warn_unless_entered
+
+
+class BusServer(AsyncOnly):
+    """Listens for as long as its ``async with`` lasts; a subclass answers, and says what the arguments are.
+
+    Parameters
+    ----------
+    bus : Bus
+    host, port, origins
+        As for `WebServer` and `WebDoor`.
+    answer : callable
+        The `Answer` of the `WebServer`.
+    """
+
+    def __init__(self, bus: Bus, host: str, port: int, origins: Iterable[str], answer: Answer) -> None:
+        self.bus = bus
+        self.address: str = ""
+        self._front = WebServer(host, port, WebDoor(host, origins), answer)
+        self._entered = False
+        self._never_entered = warn_unless_entered(self)
+
+    @property
+    def refused(self) -> int:
+        """Connections that were refused."""
+        return self._front.refused
+
+    async def __aenter__(self) -> Self:
+        if self._entered:
+            raise RuntimeError("a server is entered once: make another one")
+        self.bus._check_thread()
+        if self.bus.closed:
+            raise BusClosedError
+        self._entered = True
+        self.bus._entered.add(self)
+        self._never_entered.detach()
+        try:
+            await self._open()
+            await self._front.__aenter__()
+        except BaseException:
+            await self._stop()
+            raise
+        self.address = f"ws://{self._front.place}"
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            await self._front.__aexit__(None, None, None)
+        finally:
+            await self._stop()
+
+    async def _stop(self) -> None:
+        self.address = ""
+        self.bus._entered.discard(self)
+        await self._close()
+
+    async def _open(self) -> None:
+        """Prepare to answer."""
+
+    async def _close(self) -> None:
+        """End what `_open` has begun, as far as it came."""
