@@ -45,7 +45,7 @@ async def test_an_offset_moves_stamps_on_their_way_in_and_back_on_their_way_out(
             bus.publish([moving("map", "base", from_seconds(5.0)), moving("map", "early", from_seconds(-(2.0**31)))])
             bus.subscribe(heard.append)
             carrier.hear(RosMessage(encode([moving("map", "arm", from_seconds(9.0))]), static=False, authority="/n"))
-            carrier.hear(RosMessage(joint_state(from_seconds(3.0), {"hip": 0.5}), False, "/n", joints=True))
+            carrier.hear(RosMessage(joint_state(from_seconds(3.0), {"hip": 0.5}), False, "/n", "joints"))
             await until(lambda: link.statistics().received_messages == 2)
             assert link.statistics().not_sent == {"stamp": 1}
     assert carrier.said == [(False, [("map", "base", from_seconds(3.0))])]
