@@ -314,10 +314,7 @@ def _raw(seconds: int, nanoseconds: int, parent: str, child: str, numbers: Seque
 
 
 def _inverted(sample: TransformStamped | None) -> TransformStamped | None:
-    if sample is None:
-        return None
-    transform = sample.transform.inverse()
-    return TransformStamped(sample.child, sample.parent, sample.stamp, transform, sample.authority, sample.static)
+    return None if sample is None else (~sample).replace(authority=sample.authority)
 
 
 Run = tuple[str, int]
