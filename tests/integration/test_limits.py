@@ -29,7 +29,7 @@ links.rosbridge.rosbridge_link.MOST_QUEUED links.rosbridge.rosbridge_link.SILENC
 links.rosbridge.rosbridge_link.MOST_SAID links.rosbridge.protocol.MAX_VALUE links.rosbridge.protocol.MAX_TEXT
 links.rosbridge.protocol.MOST_TRANSFORMS links.rosbridge.protocol.QUEUE links.dds.dds_link._DEPTH
 links.dds.dds_link._KEPT links.dds.readers.MOST_WAITING links.dds.readers.MOST_BYTES links.ros.settings._LAST_DOMAIN
-_aio.web_door.MAX_HEAD _aio.web_door.HEAD_TIME links.foxglove.MAX_CONNECTIONS view.server.MAX_CONNECTIONS
+_aio.web_door.MAX_HEAD _aio.web_door.HEAD_TIME _aio.web_server.MAX_CONNECTIONS view.server.MAX_CONNECTIONS
 view.server.CAPACITY view.page.EVENTS_KEPT view.page._MATCHES view.page.SAMPLES view.server._PORTS_TRIED
 view.server.MAX_MESSAGE view.server.MAX_TEXT view.meshes.MAX_BYTES view.meshes.MAX_NUMBERS view.meshes.MAX_VERTICES
 view.meshes.MAX_SHAPES plot.plots.SAMPLES plot.plots.LONGEST_NAME
