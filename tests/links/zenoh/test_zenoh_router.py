@@ -104,14 +104,12 @@ async def test_a_router_whose_session_breaks_at_once_says_so_at_first_and_later_
         with pytest.raises(OSError, match="the session with a router broke at once: closed"):
             async with ZenohRouter(address):
                 raise AssertionError("it has opened")
-    async with (
-        ZenohRouter(address),
-        listening(domain, connect=address) as one,
-        listening(domain, connect=address) as two,
-    ):
+    async with ZenohRouter(address):
+        # zenoh panics now and then if a client connects while the session of a router closes.
         await until(lambda: not kinds)
-        await met(one, two)
-        await talk(one, two)
+        async with listening(domain, connect=address) as one, listening(domain, connect=address) as two:
+            await met(one, two)
+            await talk(one, two)
 
 
 class Broken(Neighbours):
