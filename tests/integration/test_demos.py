@@ -512,6 +512,7 @@ def test_the_web_application_holds_nothing_for_a_client_that_would_wait_for_ever
     assert "less than or equal to 60" in response.text
 
 
+@pytest.mark.thorough
 def test_the_web_application_streams_no_frame_that_nobody_has_published(server: str) -> None:
     assert get(f"{server}/changes/robot1/lazer").status_code == 404
     with connect(f"ws://{server}/poses/robot1/lazer", proxy=None) as poses:
@@ -520,6 +521,7 @@ def test_the_web_application_streams_no_frame_that_nobody_has_published(server: 
         assert poses.close_code == 4404
 
 
+@pytest.mark.thorough
 def test_nothing_stays_in_the_web_application_of_clients_that_have_left() -> None:
     async def leave(address: str, politely: bool) -> None:
         # A static transform changes once: after that, the service has nothing more to send.

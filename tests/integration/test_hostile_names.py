@@ -413,6 +413,7 @@ def test_no_command_prints_a_name_of_a_domain_as_it_is(tfbus: Command, arguments
 
 
 @pytest.mark.parametrize("arguments", OF_BOTH.values(), ids=OF_BOTH)
+@pytest.mark.thorough
 def test_no_command_between_a_file_and_a_domain_prints_a_name_as_it_is(
     recording: Path, plain_recording: Path, tfbus: Command, arguments: Sequence[object]
 ) -> None:

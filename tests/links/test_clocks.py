@@ -169,14 +169,15 @@ def test_the_offset_of_a_peer_and_its_drift_are_told_within_seconds(ahead: float
         assert found.drift == pytest.approx(sign * drift, abs=50e-6)
 
 
-def test_no_offset_is_told_in_an_hour_of_delays_if_there_is_none() -> None:
+@pytest.mark.parametrize("minutes", [5, pytest.param(60, marks=pytest.mark.thorough)])
+def test_no_offset_is_told_in_an_hour_of_delays_if_there_is_none(minutes: int) -> None:
     world = World(1)
     network = Network(world)
     draw = random.Random(5)
     network.delay = lambda *_: draw.choice((0.001, 0.02, draw.expovariate(10.0), draw.expovariate(1.0)))
     here, there = (world.process(network, clock=SkewedClock(world)) for _ in range(2))
     with here.bus.events() as events:
-        go(world, 3600.0, 1.0, (there, "cart", there.bus.clock))  # type: ignore[arg-type]
+        go(world, 60.0 * minutes, 1.0, (there, "cart", there.bus.clock))  # type: ignore[arg-type]
         assert not [event for event in iter(events.queue.get, None) if isinstance(event, ClockOffset)]
     assert clock_of(here, there).bound is not None
 

@@ -336,6 +336,7 @@ def test_keys_steer_it_on_a_terminal_which_is_as_before_while_it_is_stopped_and_
         assert os.waitstatus_to_exitcode(play.wait()) == status
 
 
+@pytest.mark.thorough
 def test_where_standard_error_is_no_terminal_each_key_tells_the_state_in_a_line(hour: Path, tmp_path: Path) -> None:
     told = tmp_path / "told"
     with session(hour, "--domain", new_domain(), errors=told) as play:

@@ -11,6 +11,6 @@ def directory() -> Iterator[str]:
         yield made
 
 
-@pytest.fixture(params=[False, True], ids=["unix", "loopback"])
+@pytest.fixture(params=[False, pytest.param(True, marks=pytest.mark.thorough)], ids=["unix", "loopback"])
 def loopback(request: pytest.FixtureRequest) -> bool:
     return bool(request.param)
