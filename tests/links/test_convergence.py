@@ -11,6 +11,7 @@ import pytest
 from support.domains import Network, Process, Stranger, World, agree, shown
 from support.samples import moving, static
 
+from tfbus import Buffer, Covariance, Transform, UncertainSample
 from tfbus.links.message import Kind
 
 NAMES = [f"static{k}" for k in range(5)]
@@ -363,3 +364,23 @@ def test_many_static_frames_reach_a_late_joiner_in_parts() -> None:
     assert late.frames.keys() == one.frames.keys()
     assert len(late.seen) == 3_010
     assert network.sent(Kind.QUESTION) <= 8
+
+
+def test_covariances_reach_other_buses_bridges_and_late_joiners() -> None:
+    world = World()
+    near, far = Network(world), Network(world)
+    here, bridge, there = world.process(near), world.process(near, far), world.process(far)
+    world.run(3.0)
+    error, calibration = Covariance.of(xyz=0.3, rpy=0.01), Covariance.of(xyz=0.4)
+    now = here.bus.clock.now()
+    with Buffer(bridge.bus) as early, Buffer(there.bus) as other:
+        here.bus.publish([UncertainSample("map", "base", now, Transform(), covariance=error, kind="drift")])
+        here.bus.publish([UncertainSample("base", "eye", now, Transform(), static=True, covariance=calibration)])
+        world.run(5.0)
+        late = world.process(far)
+        with Buffer(late.bus) as last:
+            world.run(5.0)
+            for buffer in (early, other, last):
+                found = buffer.lookup_nowait("map", "eye", covariance=True)
+                assert found.covariance.sigmas == pytest.approx([0.5] * 3 + [0.01] * 3)
+                assert found.exact == ()

@@ -4,7 +4,7 @@ import socket
 import struct
 import sys
 from collections.abc import AsyncIterator, Callable
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ pytest.importorskip("foxglove", reason="serving Foxglove needs foxglove-sdk")
 from support.processes import free_ports, is_free
 from support.samples import moving, static
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 from websockets.typing import Origin, Subprotocol
 
 from tfbus import SECOND, Bus, BusClosedError, SimulatedClock, Transform, TransformStamped
@@ -33,7 +34,9 @@ class Application:
     """A stand-in for the Foxglove application: it subscribes to the one channel, and reads messages."""
 
     def __init__(self, address: str) -> None:
-        self._socket: ClientConnection = connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")], proxy=None)
+        self._ending = ExitStack()
+        opening = connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")], proxy=None)
+        self._socket: Connection = self._ending.enter_context(opening)
         self.channel: dict[str, Any] = {}
         while not self.channel:
             message = self._socket.recv(timeout=30.0)
@@ -52,7 +55,7 @@ class Application:
                 return [decoded(each) for each in decode_fields(message[13:]).get(1, [])]
 
     def close(self) -> None:
-        self._socket.close()
+        self._ending.close()
 
 
 def decode_fields(data: bytes) -> dict[int, list[Any]]:
@@ -260,18 +263,17 @@ def test_an_invalid_port_is_refused_at_once(bus: Bus, port: Any, error: type[Exc
 
 def status_of(address: str, origin: str | None, host: str | None = None) -> int:
     """The status that a page of this origin gets when it connects; 101 if it is let in."""
+    opening = {
+        "origin": None if origin is None else Origin(origin),
+        "additional_headers": None if host is None else {"Host": host},
+        "subprotocols": [Subprotocol("foxglove.sdk.v1")],
+        "proxy": None,
+    }
     try:
-        socket_ = connect(
-            address,
-            origin=None if origin is None else Origin(origin),
-            additional_headers=None if host is None else {"Host": host},
-            subprotocols=[Subprotocol("foxglove.sdk.v1")],
-            proxy=None,
-        )
+        with connect(address, **opening):  # type: ignore[arg-type]
+            return 101
     except InvalidStatus as error:
         return error.response.status_code
-    socket_.close()
-    return 101
 
 
 @pytest.mark.every_loop

@@ -1,11 +1,13 @@
 import json
 import math
+import pickle
 import random
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,7 +15,8 @@ from support import strategies as some
 from support.processes import peak_of
 from support.samples import moving, static
 
-from tfbus import SECOND, TransformStamped
+from tfbus import SECOND, Covariance, Transform, TransformStamped, UncertainSample
+from tfbus.geometry.covariance import Kind as ErrorKind
 from tfbus.links.clocks import read_section, write_section
 from tfbus.links.message import (
     LONGEST_WAY,
@@ -164,6 +167,25 @@ def test_the_stamps_that_a_link_has_corrected_are_written_as_their_sender_gave_t
     assert [sample.stamp for sample in come.samples] == [7, 1]
 
 
+def test_covariances_come_with_their_samples_and_the_others_have_none() -> None:
+    half = np.arange(36.0).reshape(6, 6) % 7.0
+    errors = [Covariance(half @ half.T), Covariance.of(xyz=0.1), Covariance.of(rpy=0.2)]
+    kinds: list[ErrorKind] = ["drift", "independent", "constant"]
+    samples = [
+        UncertainSample("map", kind, 5, Transform(), "slam", kind == "constant", covariance=error, kind=kind)
+        for error, kind in zip(errors, kinds, strict=True)
+    ]
+    come = read(write_message(LIVE, [batch(moving("map", "a", 1), *samples), batch(static("map", "b"))])).entries
+    assert facts(come) == facts([batch(moving("map", "a", 1), *samples), batch(static("map", "b"))])
+    first, second = (entry.samples for entry in come if isinstance(entry, ReceivedBatch))
+    assert not isinstance(first[0], UncertainSample)
+    assert not isinstance(second[0], UncertainSample)
+    for got, error, kind in zip(first[1:], errors, kinds, strict=True):
+        for each in (got, pickle.loads(pickle.dumps(got))):
+            assert isinstance(each, UncertainSample)
+            assert (each.covariance, each.kind) == (error, kind)
+
+
 def test_the_section_of_clocks_is_taken_off_before_a_message_is_read() -> None:
     section = write_section(5, None, [(b"8 bytes!", 6, 7)])
     message = write_message(replace(LIVE, kind=Kind.SIGN, clocks=section))
@@ -286,6 +308,11 @@ def test_a_sample_that_no_message_can_hold_is_told_with_the_reason() -> None:
 
 # Foreign bytes
 
+UNCERTAIN = (
+    header(origins=1, authorities=1, entries=1) + ONE + NO_CLOCK + b"\0\0" + struct.pack("<BHHQ", 2, 0, 1, 1) + b"\0\0"
+)
+"""A batch of one sample, whose covariance is missing."""
+
 
 @pytest.mark.parametrize(
     ("data", "reason"),
@@ -305,7 +332,11 @@ def test_a_sample_that_no_message_can_hold_is_told_with_the_reason() -> None:
         (header(authorities=1) + b"\4\0slo", "head"),
         (header(authorities=1) + b"\1\0\xff", "head"),
         (header(origins=1, entries=1) + ONE + NO_CLOCK, "head"),
-        (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(2, 0, 0, 1), "head"),
+        (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(3, 0, 0, 1), "head"),
+        (header(origins=1, authorities=1, entries=1) + ONE + NO_CLOCK + b"\0\0" + entry(2, 0, 1, 1) + tags(0), "head"),
+        (UNCERTAIN + b"\1" + struct.pack("<21d", *[math.nan] * 21), "head"),
+        (UNCERTAIN + b"\1" + struct.pack("<21d", *[-1.0] * 21), "head"),
+        (UNCERTAIN + b"\4" + bytes(168), "head"),
         (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(1, 1, 1, 1) + b"a", "head"),
         (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(1, 0, 2, 1) + b"a", "head"),
         (header(origins=1, entries=1) + ONE + NO_CLOCK + entry(1, 0, 1, 1) + b"\xff", "head"),

@@ -24,6 +24,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 from websockets.typing import Origin
 
+import tfbus
 from tfbus import (
     LATEST,
     SECOND,
@@ -284,6 +285,7 @@ async def test_a_flood_of_orders_waits_at_its_own_connection_and_none_is_lost() 
         assert (view.statistics().dropped, view.refused) == (0, 0)
 
 
+@pytest.mark.skipif(tfbus.kernel == "python", reason="a picture takes as many calls as a copy of the tree")
 async def test_no_turn_of_the_loop_copies_a_tree() -> None:
     shown = Shown(*(moving(f"f{k // 2}", f"f{k + 1}", 99 * SECOND) for k in range(300)))
     calls, most, ended = 0, 0, False

@@ -38,9 +38,9 @@ from tfbus.links.replica import (
     Agreement,
     Claim,
     Entry,
+    FromLink,
     Provenance,
     ReceivedBatch,
-    ReceivedTransform,
     RemovedFrame,
     TooManyEntriesError,
     View,
@@ -395,7 +395,7 @@ class DomainEnd(Endpoint):
         for error in heard.errors:
             self.reject(peer.id, error.reason, error)
         view, news = self._view_of(peer.robot), False
-        together: list[ReceivedTransform] = []
+        together: list[FromLink] = []
         for entry in heard.entries:
             if not self.relay.is_plausible(entry.sequence):
                 # It would make all later numbers of its origin old.
@@ -440,9 +440,7 @@ class DomainEnd(Endpoint):
         is_live = heard.kind is Kind.LIVE and bool(moving)
         return is_live and self.clocks.jumps(peer.id, entry.origin, entry.clock, source.clock, source.shift)
 
-    def _correct(
-        self, peer: Peer, source: Provenance, moving: Sequence[ReceivedTransform], *, direct: bool = False
-    ) -> None:
+    def _correct(self, peer: Peer, source: Provenance, moving: Sequence[FromLink], *, direct: bool = False) -> None:
         """Find the clock of a source, and if stamps are to be corrected, move those of its samples, which are new."""
         source.clock, shift = self.clocks.place(peer.id, source.told, direct=direct)
         if shift and all(FIRST_STAMP <= sample._fields[2] + shift < END_OF_STAMPS for sample in moving):
@@ -461,7 +459,7 @@ class DomainEnd(Endpoint):
         peer.is_placed = True
         for known in list(self.relay.replica.entries.values()) if is_measured else ():
             source, sample = known.source, known.sample
-            if source.peer is not peer or source.clock is not None or not isinstance(sample, ReceivedTransform):
+            if source.peer is not peer or source.clock is not None or not isinstance(sample, FromLink):
                 continue
             # Others may hold the sample as it came.
             moved = sample.again()
@@ -501,14 +499,14 @@ class DomainEnd(Endpoint):
         return is_news
 
     def _judge(
-        self, peer: Peer, view: View, source: Provenance, samples: Iterable[ReceivedTransform], kind: Kind
-    ) -> tuple[bool, list[ReceivedTransform]]:
+        self, peer: Peer, view: View, source: Provenance, samples: Iterable[FromLink], kind: Kind
+    ) -> tuple[bool, list[FromLink]]:
         """Note the samples of a batch; returns whether any was news for the map, and those to publish."""
         replica, live = self.relay.replica, kind is Kind.LIVE
         hides = self.drop_lost and not self.relay.reaches(source.origin)
         # The newest sample of a moving frame would make its past no news.
         waits = bool(self._history.open) and kind not in (Kind.LIVE, Kind.PAST)
-        admitted: list[ReceivedTransform] = []
+        admitted: list[FromLink] = []
         news = False
         for sample in samples:
             _, child, _, _, _, static = sample._fields
@@ -537,7 +535,7 @@ class DomainEnd(Endpoint):
         self.relay.admit(admitted, source)
         return news, admitted
 
-    def _publish(self, samples: list[ReceivedTransform], kind: Kind) -> None:
+    def _publish(self, samples: list[FromLink], kind: Kind) -> None:
         if samples and not self.bus.closed:
             with nullcontext() if kind is Kind.LIVE else self.bus._kept_samples():
                 self.bus.publish(samples, invalid="drop")
@@ -627,11 +625,11 @@ class DomainEnd(Endpoint):
 
     def _show(self) -> None:
         """Publish the entries that were kept from the bus, as far as their buses are reached now."""
-        found: list[ReceivedTransform] = []
+        found: list[FromLink] = []
         for known in self.relay.replica.entries.values():
             sample, source = known.sample, known.source
             is_here = not self.drop_lost or self.relay.reaches(source.origin)
-            if is_here and isinstance(sample, ReceivedTransform) and self.relay.is_news(known, sample, source):
+            if is_here and isinstance(sample, FromLink) and self.relay.is_news(known, sample, source):
                 self.relay.admit([sample], source)
                 found.append(sample)
         self._publish(found, Kind.ANSWER)

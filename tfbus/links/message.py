@@ -11,6 +11,8 @@ sender holds. The samples themselves are a TFMessage behind that. Little endian:
     authorities  length u16, UTF-8
     entries      kind u8, origin u16, samples u16, sequence u64, and then
         batch    for each sample: twice the place of its authority, and one more for a static one, u16
+        batch with covariances, the same, and then for each sample: u8, zero if it has none, or one more than the place
+                 of its kind in `tfbus.geometry.covariance.KINDS`, and the upper half of its covariance, 21 f64
         removal  the length of the name in place of samples, UTF-8
     samples      a TFMessage with the samples of all batches, in their order
     clocks       the section of `tfbus.links.clocks`, if the flags say so
@@ -34,6 +36,8 @@ from dataclasses import dataclass, field, replace
 from sys import intern
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from tfbus.errors import (
     BusClosedError,
     ClockResetError,
@@ -42,14 +46,25 @@ from tfbus.errors import (
     TransformError,
     TransformLookupError,
 )
+from tfbus.geometry.covariance import KINDS, Covariance
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.uncertain import Belief, UncertainSample
 from tfbus.links.clocks import split_section
-from tfbus.links.replica import Claim, Entry, OutgoingBatch, ReceivedBatch, ReceivedTransform, RemovedFrame
+from tfbus.links.replica import (
+    Claim,
+    Entry,
+    FromLink,
+    OutgoingBatch,
+    ReceivedBatch,
+    ReceivedTransform,
+    ReceivedUncertain,
+    RemovedFrame,
+)
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
 from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode, decode_in_parts, encode, refusal
 
-VERSION = 5
+VERSION = 6
 MAX_BYTES = 2**22
 """The largest message with samples that is sent or read."""
 MAX_HEAD = 2**20
@@ -68,6 +83,7 @@ _LARGE = 2**15
 _PART = 200
 """The samples or entries of a large message that are handled before other tasks may have their turn."""
 _PART_OF_HEAD = 1_000
+_BELIEFS_AT_ONCE = 50
 _LONGEST_AUTHORITY = 65_535
 FIRST_STAMP, END_OF_STAMPS = -(2**31) * SECOND, 2**31 * SECOND
 _HELD: set[tuple[str, str, str]] = set()
@@ -85,7 +101,9 @@ _ENTRY = struct.Struct("<BHHQ")
 _LENGTH = struct.Struct("<H")
 _TIME = struct.Struct("<q")
 _ORIGIN = struct.Struct("<16sq")
-_BATCH, _REMOVAL = 0, 1
+_BATCH, _REMOVAL, _UNCERTAIN = 0, 1, 2
+_COVARIANCE = struct.Struct("<21d")
+_UPPER = np.triu_indices(6)
 _FINAL, _PARTIAL, _HAS_TIME, _SERVES, _HAS_CLOCKS = 1, 2, 4, 8, 16
 _NO_CLOCK = -(2**63)
 _BUS = 16
@@ -279,7 +297,10 @@ def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
             2 * authorities.setdefault(authority, len(authorities)) + static
             for _, _, _, _, authority, static in (sample._fields for sample in entry.samples)
         ]
-        body += _ENTRY.pack(_BATCH, origin, len(tags), entry.sequence) + struct.pack(f"<{len(tags)}H", *tags)
+        kind = _BATCH if all(sample._is_plain for sample in entry.samples) else _UNCERTAIN
+        body += _ENTRY.pack(kind, origin, len(tags), entry.sequence) + struct.pack(f"<{len(tags)}H", *tags)
+        if kind == _UNCERTAIN:
+            body += b"".join(map(_write_belief, entry.samples))
     claim = out.claim
     flags = _FINAL * claim.final | _PARTIAL * claim.partial | _HAS_TIME * (out.time is not None) | _SERVES * out.serves
     flags |= _HAS_CLOCKS * bool(out.clocks)
@@ -300,16 +321,26 @@ def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
     return bytes(head + body)
 
 
+def _write_belief(sample: TransformStamped) -> bytes:
+    if not isinstance(sample, UncertainSample):
+        return b"\0"
+    return bytes((1 + KINDS.index(sample.kind),)) + _COVARIANCE.pack(*sample.covariance.matrix[_UPPER].tolist())
+
+
 # Reading
 
 
 class _Batch(NamedTuple):
-    """A batch as the head of a message tells it; its tags are the authority of each sample and whether it is static."""
+    """A batch as the head of a message tells it; its tags are the authority of each sample and whether it is static.
+
+    It has as many beliefs as samples if one of them has a covariance, and otherwise none.
+    """
 
     origin: bytes
     clock: int
     sequence: int
     tags: Sequence[tuple[str, bool]]
+    beliefs: Sequence[Belief | None]
 
 
 def kind_of(data: bytes) -> Kind | None:
@@ -376,7 +407,11 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
             size += 1
             heard.entries.append(entry)
             continue
-        valid = [sample for sample in samples[place : place + len(entry.tags)] if sample is not None]
+        decoded_samples = samples[place : place + len(entry.tags)]
+        valid: list[FromLink] = [sample for sample in decoded_samples if sample is not None]
+        if entry.beliefs:
+            pairs = zip(decoded_samples, entry.beliefs, strict=True)
+            valid = [_with_belief(sample, belief) for sample, belief in pairs if sample is not None]
         place += len(entry.tags)
         size += 1 + len(entry.tags)
         clock = None if entry.clock == _NO_CLOCK else entry.clock
@@ -437,7 +472,7 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
         if entry_kind == _REMOVAL and size <= MAX_NAME:
             entries.append(RemovedFrame(origins[origin][0], entry_number, data[at : at + size].decode()))
             at += size
-        elif entry_kind == _BATCH:
+        elif entry_kind in (_BATCH, _UNCERTAIN):
             count += size
             if count > MAX_SAMPLES:
                 raise MalformedMessageError("oversized", f"a message of more than {MAX_SAMPLES} samples")
@@ -445,7 +480,14 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
             at += 2 * size
             named = [(authorities[tag >> 1], bool(tag & 1)) for tag in tags]
             named_origin, clock = origins[origin]
-            entries.append(_Batch(named_origin, clock, entry_number, named))
+            beliefs: list[Belief | None] = []
+            if entry_kind == _UNCERTAIN:
+                for k in range(size):
+                    belief, at = _read_belief(data, at)
+                    beliefs.append(belief)
+                    if k % _BELIEFS_AT_ONCE == _BELIEFS_AT_ONCE - 1:
+                        yield None
+            entries.append(_Batch(named_origin, clock, entry_number, named, beliefs))
         else:
             raise IndexError
     # Slicing past the end raises nothing, so the end is checked.
@@ -453,6 +495,28 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
         raise IndexError
     claim = Claim(since, sequence, digest, bool(flags & _FINAL), bool(flags & _PARTIAL))
     return Heard(kind, bus, number, claim, time, reach, bool(flags & _SERVES)), entries, at
+
+
+def _read_belief(data: bytes, at: int) -> tuple[Belief | None, int]:
+    """The covariance and kind at a place of a head, if there is one, and the place behind it."""
+    if not data[at]:
+        return None, at + 1
+    matrix = np.zeros((6, 6))
+    matrix[_UPPER] = _COVARIANCE.unpack_from(data, at + 1)
+    matrix.T[_UPPER] = matrix[_UPPER]
+    try:
+        belief = Belief(Covariance(matrix), KINDS[data[at] - 1])
+    except ValueError as error:
+        raise MalformedMessageError("head", f"a covariance of a message is none: {error}") from None
+    return belief, at + 1 + _COVARIANCE.size
+
+
+def _with_belief(sample: ReceivedTransform, belief: Belief | None) -> FromLink:
+    if belief is None:
+        return sample
+    found = ReceivedUncertain.__new__(ReceivedUncertain)
+    found._fields, found.belief = sample._fields, belief
+    return found
 
 
 # Lookups

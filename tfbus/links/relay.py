@@ -36,7 +36,7 @@ from tfbus.errors import UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.links.clocks import OwnClock
 from tfbus.links.message import can_hold, sendable
-from tfbus.links.replica import Entry, Known, OutgoingBatch, Provenance, ReceivedTransform, RemovedFrame, Replica, View
+from tfbus.links.replica import Entry, FromLink, Known, OutgoingBatch, Provenance, RemovedFrame, Replica, View
 from tfbus.links.seams import Host
 from tfbus.registration import Registration
 from tfbus.rows import Row
@@ -265,10 +265,10 @@ class Relay:
         number = known.numbers.get(source.origin)
         return (known.numbers.get(b"", -1) if number is None else number) < source.sequence
 
-    def admit(self, news: Iterable[ReceivedTransform], source: Provenance) -> None:
+    def admit(self, news: Iterable[FromLink], source: Provenance) -> None:
         """Take the news of one batch for heard, which are to be published next."""
         for sample in news:
-            sample._provenance = source
+            sample._provenance = source  # type: ignore[misc]
             numbers = self.replica.entries[sample._fields[1]].numbers
             numbers[source.origin] = source.sequence
             if len(numbers) > MOST_ORIGINS:
@@ -431,7 +431,7 @@ def relay_of(bus: Bus) -> Relay:
 
 
 def _source_of(sample: TransformStamped) -> Provenance | None:
-    return sample._provenance if type(sample) is ReceivedTransform else None
+    return sample._provenance if isinstance(sample, FromLink) else None
 
 
 def _key(sample: TransformStamped) -> tuple[str, int, Row | None]:

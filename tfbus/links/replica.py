@@ -74,7 +74,7 @@ from itertools import islice
 from math import inf
 from operator import itemgetter
 from random import uniform
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 try:
     # hashlib has it too, but loads OpenSSL for others, which takes 0.6 MB of each process with a link.
@@ -83,6 +83,7 @@ except ImportError:  # A Python that has it elsewhere.
     from hashlib import blake2b
 
 from tfbus.geometry.stamped import TransformStamped, shifted
+from tfbus.geometry.uncertain import UncertainSample, with_belief
 from tfbus.rows import Row
 
 SETTLING = 1.5
@@ -207,28 +208,44 @@ class Provenance:
         return self.sequence, self.origin
 
 
-class ReceivedTransform(TransformStamped):
+class FromLink(TransformStamped):
     """A sample that came over a link; equal to one that did not."""
 
-    __slots__ = ("_provenance",)
+    __slots__ = ()
     _provenance: Provenance
 
-    def again(self) -> "ReceivedTransform":
+    def again(self) -> Self:
         """The same once more, so that its fields may change."""
-        again = ReceivedTransform.__new__(ReceivedTransform)
-        again._fields, again._provenance = self._fields, self._provenance
+        again = type(self).__new__(type(self))
+        again._fields, again._provenance = self._fields, self._provenance  # type: ignore[misc]
+        again._take(self)
         return again
+
+
+class ReceivedTransform(FromLink):
+    """A sample without a covariance."""
+
+    __slots__ = ("_provenance",)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy in another process has not come over this link.
         return TransformStamped, (self.parent, self.child, self.stamp, self.transform, self.authority, self.static)
 
 
+class ReceivedUncertain(FromLink, UncertainSample):
+    """A sample with a covariance."""
+
+    __slots__ = ("_provenance",)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return with_belief, (TransformStamped.replace(self), self.belief)
+
+
 class ReceivedBatch(OutgoingBatch):
     """A batch as it came in; the provenance of its samples is not set yet."""
 
     __slots__ = ()
-    samples: list[ReceivedTransform]
+    samples: list[FromLink]
 
 
 # The map
