@@ -7,6 +7,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from support.domains import SECOND, Network, Process, SkewedClock, World
+from support.foreign_world import ForeignWorld
+from support.samples import moving
 
 from tfbus import (
     Buffer,
@@ -329,3 +331,14 @@ def test_a_correction_moves_smoothly_and_stays_in_order() -> None:
     steps = [later.stamp - earlier.stamp for earlier, later in pairwise(here.seen)]
     assert len(steps) > 5_000
     assert max(abs(step - SECOND // 100) for step in steps) < 100_000
+
+
+def test_frames_that_came_from_another_world_first_are_settled_once_clocks_are_known() -> None:
+    world = World()
+    network, foreign = Network(world), ForeignWorld()
+    here, there = (world.process(network, worlds=[foreign], clock=SkewedClock(world)) for _ in range(2))
+    for stamp in range(50):
+        here.bus.publish([moving("map", "base", stamp)])
+        world.run(0.05)
+    world.run(5.0)
+    assert not any(end.rejected for process in (here, there) for end in process.ends)

@@ -461,8 +461,8 @@ class DomainEnd(Endpoint):
             source, sample = known.source, known.sample
             if source.peer is not peer or source.clock is not None or not isinstance(sample, FromLink):
                 continue
-            # Others may hold the sample as it came.
-            moved = sample.again()
+            # Others may hold the sample as it came. It has no source yet if the bus had it from elsewhere.
+            moved = sample.again(source)
             self._correct(peer, source, () if sample.static else (moved,))
             if source.shift and not sample.static:
                 known.sample = moved

@@ -214,10 +214,10 @@ class FromLink(TransformStamped):
     __slots__ = ()
     _provenance: Provenance
 
-    def again(self) -> Self:
-        """The same once more, so that its fields may change."""
+    def again(self, source: Provenance) -> Self:
+        """The same from its source once more, so that its fields may change."""
         again = type(self).__new__(type(self))
-        again._fields, again._provenance = self._fields, self._provenance  # type: ignore[misc]
+        again._fields, again._provenance = self._fields, source  # type: ignore[misc]
         again._take(self)
         return again
 
