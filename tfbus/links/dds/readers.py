@@ -41,6 +41,8 @@ WRITERS_TIME = 1.5
 """s; the longest that the writers of those are waited for."""
 GREETING_TIME = 0.5
 """s; for so long there is a second reader, which new writers greet."""
+_READING = Lock()
+"""The library converts settings by memory that all threads share, and two threads would free it twice."""
 _PERIOD = 0.002
 _MOST = 10_000
 _LONGEST_NAME = 256
@@ -79,7 +81,8 @@ def program() -> str:
 def read(reader: BuiltinDataReader) -> list[Any]:
     """All that the library tells of, such as participants; nothing while a name among them is no text."""
     try:
-        found: list[Any] = reader.read(N=_MOST)
+        with _READING:
+            found: list[Any] = reader.read(N=_MOST)
     except UnicodeDecodeError:
         # A stranger has called a participant so. The library reads all of them or none.
         return []
