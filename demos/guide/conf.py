@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from importlib.metadata import version as version_of
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy.typing as npt
 import numpydoc.xref
@@ -272,7 +272,8 @@ def analyze(self: ModuleAnalyzer) -> None:
 
 
 read_with_overloads = ModuleAnalyzer.analyze
-ModuleAnalyzer.analyze = analyze  # type: ignore[method-assign]
+analyzer: Any = ModuleAnalyzer
+analyzer.analyze = analyze
 
 
 def setup(app: Sphinx) -> None:
