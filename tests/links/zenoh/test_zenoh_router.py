@@ -99,14 +99,23 @@ async def test_a_router_whose_session_breaks_at_once_says_so_at_first_and_later_
     breaks: str, address: str, domain: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kinds: list[Any] = [Broken] if breaks == "at first" else [Silent, Broken]
-    monkeypatch.setattr(wire, "Neighbours", lambda session: (kinds.pop(0) if kinds else Neighbours)(session))
+    lasting: list[zenoh.Session] = []
+
+    def neighbours(session: zenoh.Session) -> Neighbours:
+        if kinds:
+            broken: Neighbours = kinds.pop(0)(session)
+            return broken
+        lasting.append(session)
+        return Neighbours(session)
+
+    monkeypatch.setattr(wire, "Neighbours", neighbours)
     if breaks == "at first":
         with pytest.raises(OSError, match="the session with a router broke at once: closed"):
             async with ZenohRouter(address):
                 raise AssertionError("it has opened")
     async with ZenohRouter(address):
         # zenoh panics now and then if a client connects while the session of a router closes.
-        await until(lambda: not kinds)
+        await until(lambda: bool(lasting))
         async with listening(domain, connect=address) as one, listening(domain, connect=address) as two:
             await met(one, two)
             await talk(one, two)
