@@ -1,6 +1,6 @@
 """Poses and points in another frame, with their own error and that of the transform."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -62,32 +62,22 @@ def with_error_of(data: Any, transform: UncertainTransform) -> Any:
     """
     moved: Any = do_transform(data, transform)
     turn = transform.transform.matrix()[:3, :3]
-    if isinstance(data, (PointStamped, PointWithCovarianceStamped)):
-        jacobian: Matrix = lever_arm(turn @ data.point)[:3]
-        error = jacobian @ transform.covariance.matrix @ jacobian.T
-        return PointWithCovarianceStamped(moved.frame, moved.stamp, moved.point, _added(moved, "covariance", error))
-    if isinstance(data, (PoseStamped, PoseWithCovarianceStamped, Odometry)):
-        jacobian = lever_arm(turn @ data.pose.translation)
-        error = jacobian @ transform.covariance.matrix @ jacobian.T
-        if isinstance(moved, Odometry):
-            return Odometry(
-                moved.frame,
-                moved.stamp,
-                moved.child,
-                moved.pose,
-                moved.linear,
-                moved.angular,
-                pose_covariance=_added(moved, "pose_covariance", error),
-                twist_covariance=moved.twist_covariance,
-            )
-        return PoseWithCovarianceStamped(moved.frame, moved.stamp, moved.pose, _added(moved, "covariance", error))
-    raise TypeError(
-        f"a {type(data).__name__} has no place for a covariance: look the transform up with covariance=True instead"
-    )
+    is_point = isinstance(data, (PointStamped, PointWithCovarianceStamped))
+    if not is_point and not isinstance(data, (PoseStamped, PoseWithCovarianceStamped, Odometry)):
+        raise TypeError(
+            f"a {type(data).__name__} has no place for a covariance: look the transform up with covariance=True instead"
+        )
+    jacobian = lever_arm(turn @ data.point)[:3] if is_point else lever_arm(turn @ data.pose.translation)
+    error = jacobian @ transform.covariance.matrix @ jacobian.T
+    if isinstance(moved, Odometry):
+        return replace(moved, pose_covariance=_added(moved.pose_covariance, error))
+    covariance = _added(getattr(moved, "covariance", None), error)
+    if is_point:
+        return PointWithCovarianceStamped(moved.frame, moved.stamp, moved.point, covariance)
+    return PoseWithCovarianceStamped(moved.frame, moved.stamp, moved.pose, covariance)
 
 
-def _added(moved: Any, name: str, error: Matrix) -> Matrix:
-    own = getattr(moved, name, None)
+def _added(own: Matrix | None, error: Matrix) -> Matrix:
     if own is None:
         return error
     return own if (own.diagonal() < 0.0).any() else np.asarray(own + error)
