@@ -208,7 +208,8 @@ class _Received:
         )
 
 
-_ANOTHER_CLOCK: Final = 1e8
+ANOTHER_CLOCK: Final = 1e8
+"""s; clocks that differ by more do not count the same time."""
 _AHEAD: Final = 1e-3
 _LATE: Final = 0.1
 
@@ -231,7 +232,7 @@ class SenderDelay:
     @property
     def remark(self) -> str:
         """The conclusion in words; empty if there is none."""
-        if abs(self.delay) > _ANOTHER_CLOCK:
+        if abs(self.delay) > ANOTHER_CLOCK:
             return "another clock (simulated?)"
         if self.delay < -_AHEAD:
             return f"its clock is at least {format_duration(from_seconds(-self.delay))} ahead of this one"

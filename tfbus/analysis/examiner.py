@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from tfbus.analysis.arrivals import ANOTHER_CLOCK
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.plain import printable
 from tfbus.rows import Row
@@ -293,7 +294,6 @@ class MovingSamples:
         yield Finding(kind, self.frame, len(places), first, float(values[worst]), unit, detail, int(stamps[worst]))
 
 
-_ANOTHER_CLOCK = 1e8
 _FIT = 20
 """The windows of a fit; the smallest delay in each is least disturbed by the network."""
 _SHORTEST_FIT = 60.0
@@ -337,7 +337,7 @@ class ClockFit:
         return cls(authority, float(leads.max()), drift)
 
     def __str__(self) -> str:
-        if abs(self.ahead) > _ANOTHER_CLOCK:
+        if abs(self.ahead) > ANOTHER_CLOCK:
             return f"{self.authority!r} stamps by another clock (simulated?)"
         side = "ahead, or more" if self.ahead >= 0 else "behind, or less"
         text = f"the clock of {self.authority!r} is {abs(self.ahead):.3g} s {side}"
@@ -462,7 +462,7 @@ class Examiner:
             stamps, received = np.concatenate(parts, axis=1)
             fit = ClockFit.of(authority, stamps, received)
             usual = float(np.quantile(time_between(received, stamps), 0.1)) / SECOND
-            if usual > self._limits.ahead or fit.drift is not None or fit.ahead < -_ANOTHER_CLOCK:
+            if usual > self._limits.ahead or fit.drift is not None or fit.ahead < -ANOTHER_CLOCK:
                 yield Finding("clock", None, len(stamps), None, fit.ahead, "s", str(fit))
 
 
