@@ -33,6 +33,7 @@ import json
 import struct
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from sys import intern
 from typing import Any, NamedTuple
 
@@ -104,6 +105,7 @@ _ORIGIN = struct.Struct("<16sq")
 _BATCH, _REMOVAL, _UNCERTAIN = 0, 1, 2
 _COVARIANCE = struct.Struct("<21d")
 _UPPER = np.triu_indices(6)
+_is_plain = attrgetter("_is_plain")
 _FINAL, _PARTIAL, _HAS_TIME, _SERVES, _HAS_CLOCKS = 1, 2, 4, 8, 16
 _NO_CLOCK = -(2**63)
 _BUS = 16
@@ -297,7 +299,7 @@ def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
             2 * authorities.setdefault(authority, len(authorities)) + static
             for _, _, _, _, authority, static in (sample._fields for sample in entry.samples)
         ]
-        kind = _BATCH if all(sample._is_plain for sample in entry.samples) else _UNCERTAIN
+        kind = _BATCH if all(map(_is_plain, entry.samples)) else _UNCERTAIN
         body += _ENTRY.pack(kind, origin, len(tags), entry.sequence) + struct.pack(f"<{len(tags)}H", *tags)
         if kind == _UNCERTAIN:
             body += b"".join(map(_write_belief, entry.samples))
@@ -407,11 +409,13 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
             size += 1
             heard.entries.append(entry)
             continue
-        decoded_samples = samples[place : place + len(entry.tags)]
-        valid: list[FromLink] = [sample for sample in decoded_samples if sample is not None]
+        come = samples[place : place + len(entry.tags)]
+        valid: list[FromLink]
         if entry.beliefs:
-            pairs = zip(decoded_samples, entry.beliefs, strict=True)
+            pairs = zip(come, entry.beliefs, strict=True)
             valid = [_with_belief(sample, belief) for sample, belief in pairs if sample is not None]
+        else:
+            valid = [sample for sample in come if sample is not None]
         place += len(entry.tags)
         size += 1 + len(entry.tags)
         clock = None if entry.clock == _NO_CLOCK else entry.clock
