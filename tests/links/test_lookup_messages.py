@@ -8,12 +8,16 @@ from hypothesis import strategies as st
 
 from tfbus import (
     LATEST,
+    Covariance,
     FutureExtrapolationError,
     LookupTimeoutError,
     RecordingError,
     RemoteLookupError,
     Transform,
     TransformStamped,
+    TransformTree,
+    UncertainSample,
+    UncertainTransform,
 )
 from tfbus.links.message import (
     MAX_TEXT,
@@ -31,11 +35,18 @@ SHORT = FutureExtrapolationError(child="base", stamp=9, oldest=1, newest=5, auth
     "message",
     [
         RemoteQuestion("map", "base", LATEST),
-        RemoteQuestion("map", "base", 7, 0.5, 1.0, LATEST, "odom", math.inf, 0.2, 0.1),
+        RemoteQuestion("map", "base", 7, 0.5, 1.0, LATEST, "odom", math.inf, 0.2, 0.1, covariance=True),
     ],
 )
 def test_a_question_is_read_as_it_was_written(message: RemoteQuestion) -> None:
     assert read_question(write_question(message)) == message
+
+
+def test_a_question_without_covariance_is_one_that_older_servers_read() -> None:
+    assert json.loads(write_question(RemoteQuestion("map", "base", 7))).keys() == {
+        *("type", "target", "source", "at", "timeout", "max_age"),
+        *("source_at", "fixed", "tolerance", "max_gap", "hold"),
+    }
 
 
 def test_so_large_a_message_is_read_and_no_larger_one() -> None:
@@ -127,6 +138,73 @@ def test_an_answer_to_another_question_is_none(answer: TransformStamped) -> None
     assert error.reason == "malformed"
 
 
+def answer_with_errors(edges: int = 2) -> UncertainTransform:
+    """At a stamp between two samples of each edge, whose covariance is full."""
+    root, tree = Covariance.of(xyz=0.1, rpy=0.2).matrix + 0.005, TransformTree()
+    for i in range(edges):
+        for stamp in (0, 10):
+            place, error = Transform((1.0, 0.1 * stamp, 0.0)), Covariance((1.0 + stamp) * root)
+            tree.insert(UncertainSample(str(i), str(i + 1), stamp, place, covariance=error, kind="drift"))
+    return tree.lookup("0", str(edges), 7, covariance=True)
+
+
+SURE = answer_with_errors()
+
+
+def read_with(**changes: Any) -> TransformStamped | Exception:
+    """An answer with covariances as it is read with some fields of its second edge, its error or a sample changed."""
+    fields = json.loads(write_answer(SURE))
+    edge = fields["edges"][1]
+    for part in (edge, edge["error"], edge["error"]["parts"][0]):
+        part |= {name: value for name, value in changes.items() if name in part}
+    return read_answer(json.dumps(fields).encode(), "tf", None)
+
+
+def test_an_answer_with_covariances_is_read_as_it_was_written() -> None:
+    found = read_with()
+    assert isinstance(found, UncertainTransform)
+    assert (found, found.links[0].climbs) == (SURE, False)
+    assert found.covariance == SURE.covariance
+    assert isinstance(read_with(error=None), UncertainTransform)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"covariance": [0.0] * 35},
+        {"covariance": [0.0, 1.0, *[0.0] * 34]},
+        {"covariance": [-1.0, *[0.0] * 35]},
+        {"covariance": ["NaN", *[0.0] * 35]},
+        {"covariance": None},
+        {"kind": "guess"},
+        {"weight": 0.7},
+        {"weight": -0.3},
+        {"weight": "NaN"},
+        {"stamp": 0.5},
+        {"parts": []},
+        {"parts": [{"stamp": 0, "weight": 1 / 3, "covariance": [0.0] * 36}] * 3},
+        {"parent": "elsewhere"},
+        {"climbs": True},
+        {"error": []},
+        {"transform": {"translation": ["Infinity", 0.0, 0.0], "rotation": [0.0, 0.0, 0.0, 1.0]}},
+    ],
+    ids=str,
+)
+def test_a_covariance_that_is_none_is_refused(changes: dict[str, Any]) -> None:
+    error = read_with(**changes)
+    assert isinstance(error, RemoteLookupError)
+    assert error.reason == "malformed"
+
+
+def test_an_answer_whose_edges_do_not_fit_a_message_is_an_error_that_says_so() -> None:
+    assert isinstance(read_answer(write_answer(answer_with_errors(55)), "tf", None), UncertainTransform)
+    error = read_answer(write_answer(answer_with_errors(200)), "tf", None)
+    assert isinstance(error, ValueError)
+    assert str(error) == (
+        "the way from '0' to '200' has 200 edges, more than an answer with covariances can tell in 131072 bytes"
+    )
+
+
 def test_an_error_that_no_lookup_raises_is_no_answer() -> None:
     error = read_answer(write_answer(RecordingError("it is cut off", path="/etc/passwd", reason="damaged")), "tf", None)
     assert isinstance(error, RemoteLookupError)
@@ -145,7 +223,7 @@ PLAIN: st.SearchStrategy[Any] = st.recursive(
     max_leaves=8,
 )
 MESSAGES = [write_question(QUESTION)]
-MESSAGES += [write_answer(answer) for answer in (FOUND, SHORT, LATE, ValueError("too long"))]
+MESSAGES += [write_answer(answer) for answer in (FOUND, SURE, SHORT, LATE, ValueError("too long"))]
 
 
 @given(st.sampled_from(MESSAGES), st.data())

@@ -8,17 +8,20 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import anyio
+import numpy as np
 import pytest
 from support.asking import Asked, settle
 from support.memory_wire import MemoryNetwork, MemoryWire
 from support.processes import until
 from support.samples import moving, static
+from support.worlds import random_covariance, random_transform
 from trio.testing import MockClock
 
 from tfbus import (
     LATEST,
     Buffer,
     Bus,
+    Covariance,
     DisconnectedError,
     FutureExtrapolationError,
     Hold,
@@ -27,7 +30,10 @@ from tfbus import (
     RemoteLookupError,
     Transform,
     TransformStamped,
+    UncertainSample,
+    UncertainTransform,
     UnknownFrameError,
+    joint,
 )
 from tfbus.links import BufferServer, DomainLink
 from tfbus.links.message import (
@@ -49,15 +55,19 @@ pytestmark = pytest.mark.anyio
 class Scene:
     """A link whose robot serves a buffer, and one that asks and hears nothing else."""
 
-    def __init__(self, network: MemoryNetwork, bus: Bus, server: BufferServer, asker: DomainLink, link: DomainLink):
+    def __init__(
+        self, network: MemoryNetwork, buffer: Buffer, server: BufferServer, asker: DomainLink, link: DomainLink
+    ):
         self.network = network
-        self.bus = bus
+        self.buffer = buffer
+        self.bus = buffer.bus
         self.server = server
         self.asker = asker
         self.link = link
 
     async def lookup(self, *arguments: Any, **options: Any) -> TransformStamped:
-        return await self.asker.lookup(*arguments, robot="r1", **options)
+        found: TransformStamped = await self.asker.lookup(*arguments, robot="r1", **options)
+        return found
 
     @property
     def counts(self) -> dict[str, Any]:
@@ -75,7 +85,7 @@ async def asked(**options: Any) -> AsyncIterator[Scene]:
             BufferServer(buffer, link, **options) as server,
             DomainLink(other, "tf", network.wire(), robots={"r1": 0.0}) as asker,
         ):
-            yield Scene(network, bus, server, asker, link)
+            yield Scene(network, buffer, server, asker, link)
         assert other.statistics().samples == 0, "a link of rate 0 hears nothing but answers"
 
 
@@ -108,6 +118,42 @@ async def test_a_lookup_is_answered_at_once_or_waits_there_until_it_can_be() -> 
             scene.bus.publish(moving("map", "base", 20, x=8.0))
         assert waiting.answer.transform.translation == (8, 0, 0)
         assert scene.counts == {"answered": 5}
+
+
+@pytest.mark.every_loop
+async def test_an_answer_with_its_error_is_that_of_the_other_buffer_and_has_its_edges_in_common_with_others() -> None:
+    async with asked() as scene, anyio.create_task_group() as tasks:
+        rng = np.random.default_rng(1)
+        scene.bus.publish([static("base", "lidar", x=2.0), static("map", "odom")])
+        for second in range(3):
+            error = Covariance((1.0 + second) * random_covariance(rng, 0.1, 0.05))
+            place = random_transform(rng)
+            scene.bus.publish(UncertainSample("odom", "base", second, place, covariance=error, kind="drift"))
+        ask: list[tuple[tuple[Any, ...], dict[str, Any]]] = [
+            (("map", "lidar"), {}),
+            (("lidar", "map", 1), {}),
+            (("base", "base", 2), {"source_at": 0, "fixed": "odom"}),
+            (("map", "base", 5), {"extrapolate": Hold(1.0)}),
+            (("map", "map", 5), {}),
+        ]
+        found: list[UncertainTransform] = []
+        known: list[UncertainTransform] = []
+        for arguments, options in ask:
+            found.append(await scene.asker.lookup(*arguments, **options, robot="r1", covariance=True))
+            known.append(scene.buffer.lookup_nowait(*arguments, **options, covariance=True))
+        for far, near in zip(found, known, strict=True):
+            assert (far, far.exact, far.linear) == (near, near.exact, near.linear)
+            assert (far.extrapolated_by, far.gap) == (near.extrapolated_by, near.gap)
+            assert far.covariance == near.covariance
+        # A far answer and a near one share the errors of their edges.
+        assert np.array_equal(joint([found[0], known[1]]).covariance, joint(known[:2]).covariance)
+        assert not joint([found[0], known[0]]).difference(0, 1).any()
+        waiting = Asked(tasks, lambda: scene.lookup("map", "base", 20, covariance=True))
+        await until(lambda: scene.server.statistics().waiting == 1)
+        scene.bus.publish(moving("odom", "base", 20))
+        await until(lambda: waiting.ended)
+        assert isinstance(waiting.answer, UncertainTransform)
+        assert waiting.answer.exact == (("map", "odom"), ("odom", "base"))
 
 
 async def test_each_error_is_that_of_the_other_buffer_with_its_facts() -> None:
@@ -359,6 +405,27 @@ async def test_whatever_a_server_answers_a_lookup_has_its_answer_or_a_remote_loo
             stranger.say(asker.id, Kind.LOOKUP_ANSWER, stranger.bodies[1][1][:8] + write_answer(FOUND))
             await until(lambda: again.ended)
             assert again.answer == FOUND
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        write_answer(FOUND),
+        write_answer(RemoteLookupError(domain="tf", robot="r1", reason="malformed", detail="no field 'covariance'")),
+    ],
+)
+async def test_a_server_that_knows_no_covariances_is_told_from_one_without_an_answer(answer: bytes) -> None:
+    network = MemoryNetwork()
+    with Bus() as bus:
+        async with DomainLink(bus, "tf", network.wire()) as asker, anyio.create_task_group() as tasks:
+            stranger = Stranger(network)
+            await stranger.open()
+            waiting = Asked(tasks, lambda: asker.lookup("map", "base", 7, robot="r1", covariance=True))
+            await until(lambda: bool(stranger.bodies))
+            stranger.say(asker.id, Kind.LOOKUP_ANSWER, stranger.bodies[0][1][:8] + answer)
+            await until(lambda: waiting.ended)
+            assert isinstance(waiting.error, RemoteLookupError)
+            assert "a server of an older version knows no covariances: ask it without them" in str(waiting.error)
 
 
 async def test_what_is_no_question_is_refused_and_counted_and_harms_nobody() -> None:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 from time import monotonic
 from types import TracebackType
-from typing import Any, Final, Self, Unpack
+from typing import Any, Final, Literal, Self, Unpack, overload
 
 import anyio
 import anyio.abc
@@ -25,10 +25,11 @@ from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import RemoteQuestion
 from tfbus.links.seams import Left, Received, Wire
 from tfbus.registration import AsyncOnly, Registration, warn_unless_entered
-from tfbus.stamps import LATEST, Latest, as_duration, as_stamp, from_seconds, to_seconds
+from tfbus.stamps import LATEST, AtLike, as_at, as_duration, from_seconds, to_seconds
 from tfbus.statistics import LinkStatistics, QueueStatistics
 from tfbus.tf_message import MalformedMessageError
-from tfbus.tree.lookup import Hold, policy_of
+from tfbus.tree.lookup import Hold, Options, policy_of
+from tfbus.uncertainty import UncertainTransform
 
 _FULL_TURN = 5_000
 """With so many samples and removals, the outbox is sent before the turn of the event loop ends."""
@@ -39,6 +40,14 @@ _OVERHEAD = 256
 """Bytes that an item takes besides its content."""
 FAR: Final = 10.0
 """s; a stamp that is further ahead is a jump, because running all timers up to it would take long."""
+
+
+class _Options(Options, total=False):
+    """The other arguments of `DomainLink.lookup`, for type checkers."""
+
+    robot: str | None
+    timeout: float | None
+    max_age: float | None
 
 
 class ReceiveQueue:
@@ -559,20 +568,31 @@ class DomainLink(Link):
         """Say to all peers whether this link serves a buffer. Called by a `BufferServer`."""
         self._domain_end.serve(server)
 
+    @overload
+    async def lookup(
+        self, target: str, source: str, at: AtLike = ..., *, covariance: Literal[True], **options: Unpack[_Options]
+    ) -> UncertainTransform: ...
+
+    @overload
+    async def lookup(
+        self, target: str, source: str, at: AtLike = ..., *, covariance: bool = ..., **options: Unpack[_Options]
+    ) -> TransformStamped: ...
+
     async def lookup(
         self,
         target: str,
         source: str,
-        at: int | Latest = LATEST,
+        at: AtLike = LATEST,
         *,
         robot: str | None = None,
         timeout: float | None = None,
         max_age: float | None = None,
-        source_at: int | Latest | None = None,
+        source_at: AtLike | None = None,
         fixed: str | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
+        covariance: bool = False,
     ) -> TransformStamped:
         """The transform from `source` to `target` in the buffer of another process, as soon as it is known there.
 
@@ -584,6 +604,9 @@ class DomainLink(Link):
             The robot whose buffer is asked; by default, that of a link without a robot. A `BufferServer` offers it.
         timeout : float, optional
             In s on the clock of the other bus, and on this machine's; None waits for as long as there is a server.
+        covariance : bool
+            As `tfbus.Buffer.lookup`. The edges of the answer come with it, so `tfbus.joint` takes it beside others,
+            local ones too. They have to fit one message: it holds more than 50 moving edges.
 
         Returns
         -------
@@ -595,7 +618,8 @@ class DomainLink(Link):
             If there is no server for 3 s, or within the timeout if that is shorter; if it goes, is too busy, or does
             not answer.
         TransformLookupError, BusClosedError, ClockResetError, TypeError, ValueError
-            As `tfbus.Buffer.lookup` there: the same error, with its facts.
+            As `tfbus.Buffer.lookup` there: the same error, with its facts. `ValueError` too for a way whose edges with
+            their covariances are more than a message holds.
         RuntimeError
             If 10,000 lookups wait already, or the link is not entered in this event loop.
 
@@ -615,13 +639,14 @@ class DomainLink(Link):
         question = RemoteQuestion(
             target=target,
             source=source,
-            at=at if isinstance(at, Latest) else as_stamp(at),
+            at=as_at(at),
             max_age=None if max_age is None else as_duration(max_age, "max_age"),
-            source_at=source_at if source_at is None or isinstance(source_at, Latest) else as_stamp(source_at),
+            source_at=as_at(source_at),
             fixed=fixed,
             tolerance=float(tolerance),
             max_gap=None if max_gap is None else float(max_gap),
             hold=None if extrapolate is None else float(extrapolate.max_age),
+            covariance=bool(covariance),
         )
         return await self.lookups.ask(question, robot, limit)
 

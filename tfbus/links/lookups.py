@@ -45,7 +45,7 @@ PATIENCE = 3.0
 _MOST_SILENCES = 3
 _NUMBER = 8
 """Bytes of the number before a question or an answer."""
-_ARGUMENTS = "target", "source", "at", "max_age", "source_at", "fixed", "tolerance", "max_gap"
+_ARGUMENTS = "target", "source", "at", "max_age", "source_at", "fixed", "tolerance", "max_gap", "covariance"
 
 
 @dataclass(eq=False, slots=True)
@@ -211,6 +211,8 @@ class RemoteLookups:
             raise self._error(robot, "lost", "it has gone" if self._is_open else "this link has ended")
         answer = read_answer(pending.answer, self._domain, robot, question)
         if isinstance(answer, Exception):
+            if question.covariance and isinstance(answer, RemoteLookupError) and answer.reason == "malformed":
+                answer.detail += "; a server of an older version knows no covariances: ask it without them"
             raise answer
         return answer
 

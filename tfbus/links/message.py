@@ -64,6 +64,7 @@ from tfbus.links.replica import (
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
 from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode, decode_in_parts, encode, refusal
+from tfbus.uncertainty.answers import UncertainTransform
 
 VERSION = 6
 MAX_BYTES = 2**22
@@ -546,11 +547,16 @@ class RemoteQuestion(PlainData):
     tolerance: float = 0.0
     max_gap: float | None = None
     hold: float | None = None
+    covariance: bool = False
 
 
 def write_question(question: RemoteQuestion) -> bytes:
     """The bytes of a question."""
-    return json.dumps(question.to_dict()).encode()
+    fields = question.to_dict()
+    if not question.covariance:
+        # A server of an older version knows no such field.
+        del fields["covariance"]
+    return json.dumps(fields).encode()
 
 
 def read_question(data: bytes) -> RemoteQuestion:
@@ -566,15 +572,19 @@ def read_question(data: bytes) -> RemoteQuestion:
         if isinstance(value, str) and len(value.encode()) > MAX_NAME:
             raise ValueError(f"its field {_shown(name)} has more than {MAX_NAME} bytes")
     try:
-        return RemoteQuestion.from_dict(fields)
+        return RemoteQuestion.from_dict({"covariance": False, **fields})
     except ValueError as error:
         raise ValueError(str(error)[:_SHOWN]) from None
 
 
 def write_answer(answer: TransformStamped | Exception) -> bytes:
-    """The bytes of an answer, or of the error of a lookup."""
+    """The bytes of an answer, or of the error of a lookup: of another one if the answer is too large."""
     if isinstance(answer, (TransformStamped, TransformError)):
-        return json.dumps(answer.to_dict()).encode()
+        data = json.dumps(answer.to_dict()).encode()
+        if len(data) <= MAX_TEXT or not isinstance(answer, UncertainTransform):
+            return data
+        way = f"the way from {_shown(answer.parent)} to {_shown(answer.child)} has {len(answer.links)} edges"
+        answer = ValueError(f"{way}, more than an answer with covariances can tell in {MAX_TEXT} bytes")
     kind = "TypeError" if isinstance(answer, TypeError) else "ValueError"
     return json.dumps({"type": kind, "message": str(answer)}).encode()
 
@@ -590,6 +600,8 @@ def read_answer(
         answer = _answer_of(_read(data))
         if question is not None and isinstance(answer, TransformStamped):
             _check_answers(answer, question)
+            if question.covariance and not isinstance(answer, UncertainTransform):
+                raise ValueError("it has no covariance")
     except Exception as error:  # noqa: BLE001 - the asker gets one kind of error for all bad answers
         detail = f"not an answer: {str(error)[:_SHOWN]}"
         return RemoteLookupError(domain=domain, robot=robot, reason="malformed", detail=detail)
@@ -599,7 +611,7 @@ def read_answer(
 def _answer_of(fields: dict[str, Any]) -> TransformStamped | Exception:
     kind = fields.get("type")
     if kind == "TransformStamped":
-        return TransformStamped.from_dict(fields)
+        return (UncertainTransform if "edges" in fields else TransformStamped).from_dict(fields)
     message = fields.get("message")
     if isinstance(kind, str) and kind in _ARGUMENT_ERRORS and isinstance(message, str):
         return _ARGUMENT_ERRORS[kind](message)

@@ -22,8 +22,9 @@ greatest standard deviation of the answer's rotation, with all edges added up, w
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -31,8 +32,9 @@ import numpy as np
 from tfbus.data import PoseWithCovarianceStamped
 from tfbus.geometry.covariance import Covariance, Matrix, covariance_of, lever_arm, root_of, turned
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.geometry.transform import Transform
+from tfbus.geometry.transform import Transform, from_row
 from tfbus.geometry.transform_array import TransformArray, from_columns, locked
+from tfbus.plain import StampsAs, from_fields, from_plain
 from tfbus.rows import IDENTITY, Columns, Quaternion, Row, Vector, compose, invert
 from tfbus.uncertainty.correlation import EdgeError, covariances
 
@@ -62,6 +64,25 @@ class Link(NamedTuple):
     row: Row
     climbs: bool
     error: EdgeError | None
+
+    @property
+    def ends(self) -> Name:
+        """Its two frames, that nearer to the target first."""
+        return (self.child, self.parent) if self.climbs else (self.parent, self.child)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        error = None if self.error is None else self.error.to_dict()
+        fields = {"parent": self.parent, "child": self.child, "transform": from_row(self.row).to_dict()}
+        return {**fields, "climbs": self.climbs, "error": error}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Link:
+        """The edge from which `to_dict` made `data`; `ValueError` if it is none."""
+        kinds = {"parent": str, "child": str, "transform": Transform, "climbs": bool, "error": EdgeError | None}
+        fields = from_fields(cls, data, kinds)
+        row, error = fields.pop("transform")._row, fields.pop("error")
+        return cls(row=row, error=error and error._replace(place=row[:3]), **fields)
 
 
 class Share(NamedTuple):
@@ -268,6 +289,48 @@ class UncertainTransform(TransformStamped):
         if not isinstance(other, UncertainTransform) or not isinstance(found, TransformStamped):
             return found
         return uncertain(found, self.links + other.links)
+
+    def to_dict(self, *, stamps: StampsAs = "int") -> dict[str, Any]:
+        """As the answer without a covariance, and its ``"edges"`` from target to source, of which the rest is computed.
+
+        Each is a dict: ``"parent"``, ``"child"``, ``"transform"``, ``"climbs"``, and ``"error"``; this is None, or has
+        ``"stamp"``, ``"kind"`` and ``"parts"``: the stamp, weight and covariance of each sample, of 36 numbers.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(UncertainSample("map", "base", 0, Transform(), covariance=Covariance.of(xyz=0.5)))
+        >>> (edge,) = tree.lookup("map", "base", covariance=True).to_dict()["edges"]
+        >>> edge["error"]["parts"][0]["covariance"][0]
+        0.25
+        """
+        policy_use = {} if self.gap is None else {"extrapolated_by": self.extrapolated_by, "gap": self.gap}
+        edges = [link.to_dict() for link in self.links]
+        return {**super().to_dict(stamps=stamps), **policy_use, "edges": edges}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> UncertainTransform:
+        """The answer from which `to_dict` made `data`.
+
+        Raises
+        ------
+        ValueError
+            As `TransformStamped.from_dict`; or if an edge is none, or does not lead on from the one before it.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> _ = tree.insert(UncertainSample("map", "base", 0, Transform(), covariance=Covariance.of(xyz=0.5)))
+        >>> found = tree.lookup("map", "base", covariance=True)
+        >>> UncertainTransform.from_dict(found.to_dict()).covariance == found.covariance
+        True
+        """
+        given = dict(data)
+        links = from_plain(tuple[Link, ...], given.pop("edges", None), "UncertainTransform.edges")
+        for link, following in pairwise(links):
+            if link.ends[1] != following.ends[0]:
+                raise ValueError(f"an edge from {following.ends[0]!r} does not lead on from {link.ends[1]!r}")
+        return uncertain(super().from_dict(given), links)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (self._fields, self.links, self._policy_use)

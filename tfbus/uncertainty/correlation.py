@@ -22,12 +22,14 @@ are interpolated from, it is the product of its weights.
 Stamps whose kinds differ count as independent of each other.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from tfbus.geometry.covariance import Kind, Matrix, lever_arm, root_of
+from tfbus.geometry.covariance import Covariance, Kind, Matrix, as_kind, lever_arm, root_of
+from tfbus.plain import from_fields
 from tfbus.rows import Vector
 
 _SHRINKS = 1e-9
@@ -41,6 +43,16 @@ class Part(NamedTuple):
     stamp: int
     weight: float
     matrix: Matrix
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {"stamp": self.stamp, "weight": self.weight, "covariance": self.matrix.ravel().tolist()}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """The sample from which `to_dict` made `data`; `ValueError` if it is none."""
+        fields = from_fields(cls, data, {"stamp": int, "weight": float, "covariance": tuple[float, ...]})
+        return cls(matrix=Covariance(fields.pop("covariance")).matrix, **fields)
 
 
 class EdgeError(NamedTuple):
@@ -68,6 +80,20 @@ class EdgeError(NamedTuple):
             return self.parts[0].matrix
         first, last = self.parts
         return np.asarray(first.weight * first.matrix + last.weight * last.matrix)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON; the place is that of the edge."""
+        return {"stamp": self.stamp, "kind": self.kind, "parts": [part.to_dict() for part in self.parts]}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """The error from which `to_dict` made `data`, at the origin; `ValueError` if it is none."""
+        fields = from_fields(cls, data, {"stamp": int, "kind": str, "parts": tuple[Part, ...]})
+        parts, kind = fields["parts"], as_kind(fields["kind"])
+        weights = [part.weight for part in parts]
+        if len(parts) not in (1, 2) or min(weights) < 0.0 or not math.isclose(sum(weights), 1.0):
+            raise ValueError(f"an error is of one sample, or of two whose weights add up to one: not of {weights}")
+        return cls(fields["stamp"], (0.0, 0.0, 0.0), kind, parts)
 
 
 def covariances(errors: Sequence[EdgeError]) -> Matrix:
