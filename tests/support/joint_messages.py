@@ -1,6 +1,7 @@
 """Messages with the positions of joints, and with odometry, by `rosbags`."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
@@ -27,14 +28,14 @@ def joint_state(
 ODOMETRY = "nav_msgs/msg/Odometry"
 
 
-def odometry(sample: TransformStamped, little_endian: bool = True) -> bytes:
+def odometry(sample: TransformStamped, little_endian: bool = True, covariance: Any = (7.0,) * 36) -> bytes:
     """Odometry in CDR, with the pose of a sample; its other numbers are 7."""
     make, stamp = TYPES.types, divmod(sample.stamp, 10**9)
     header = make["std_msgs/msg/Header"](make["builtin_interfaces/msg/Time"](*stamp), sample.parent)
     position = make["geometry_msgs/msg/Point"](*sample.transform.translation)
     turn = make["geometry_msgs/msg/Quaternion"](*sample.transform.rotation)
     pose = make["geometry_msgs/msg/PoseWithCovariance"](
-        make["geometry_msgs/msg/Pose"](position, turn), np.full(36, 7.0)
+        make["geometry_msgs/msg/Pose"](position, turn), np.array(covariance, float)
     )
     still = make["geometry_msgs/msg/Vector3"](7.0, 7.0, 7.0)
     twist = make["geometry_msgs/msg/TwistWithCovariance"](

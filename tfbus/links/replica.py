@@ -241,6 +241,15 @@ class ReceivedUncertain(FromLink, UncertainSample):
         return with_belief, (TransformStamped.replace(self), self.belief)
 
 
+def received(sample: TransformStamped) -> FromLink:
+    """A sample as one that came over a link."""
+    kind = ReceivedTransform if sample._is_plain else ReceivedUncertain
+    found = kind.__new__(kind)
+    found._fields = sample._fields
+    found._take(sample)
+    return found
+
+
 class ReceivedBatch(OutgoingBatch):
     """A batch as it came in; the provenance of its samples is not set yet."""
 

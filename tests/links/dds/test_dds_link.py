@@ -27,7 +27,7 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from support.dds import DdsNode
 
-from tfbus import Bus, PeerJoined, PeerLost, PeerRejected, SimulatedClock, TransformStamped
+from tfbus import Bus, PeerJoined, PeerLost, PeerRejected, SimulatedClock, TransformStamped, UncertainSample
 from tfbus.links.dds import DdsLink, readers
 from tfbus.links.dds.dds_link import Discovery, configuration
 from tfbus.links.dds.types import (
@@ -212,6 +212,7 @@ async def test_joints_the_time_and_a_description_come_from_topics_of_their_own(d
                     await anyio.sleep(0.01)
             assert end.link.statistics().rejected == {}
     assert end.heard[0] == moving("odom", "base", 7, 1.5, "/odom")
+    assert isinstance(end.heard[0], UncertainSample)
     assert states[0] == ({"a": 0.5}, 100_000_000_005)
     assert clock.now() == 100_000_000_005
 

@@ -24,7 +24,7 @@ from support.joint_messages import joint_state, odometry
 from support.processes import free_ports, on_one_loop, until
 from support.samples import latched, moving, static
 
-from tfbus import Bus, PeerRejected, SimulatedClock, TransformStamped
+from tfbus import Bus, PeerRejected, SimulatedClock, TransformStamped, UncertainSample
 from tfbus.links.rmw_zenoh import RmwZenohLink, rmw_zenoh_link
 from tfbus.links.rmw_zenoh.rmw_zenoh_link import (
     CLOCK_HASH,
@@ -206,7 +206,9 @@ async def test_messages_come_from_each_topic_with_any_attachment_or_none() -> No
                 odom = await end.publisher(f"odom/{ODOMETRY_TYPE}/{ODOMETRY_HASH}")
                 odom.put(odometry(moving("odom", "cart", 7, 1.5)))
                 await end.until_heard("cart")
-                assert end.heard.pop() == moving("odom", "cart", 7, 1.5, "/odom")
+                pose = end.heard.pop()
+                assert pose == moving("odom", "cart", 7, 1.5, "/odom")
+                assert isinstance(pose, UncertainSample)
                 statics = await end.publisher(f"tf_static/{TYPE}/{HASH}")
                 statics.put(encode([moving("map", "lidar", 0)]))
                 await end.until_heard("lidar")

@@ -1,17 +1,20 @@
 import json
+import math
 import struct
 from contextlib import suppress
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.joint_messages import ODOMETRY, TYPES, odometry
 from support.ros import ros1, ros1_of
 from support.samples import moving
+from support.worlds import random_covariance
 
-from tfbus import Transform, TransformStamped
+from tfbus import Transform, TransformStamped, UncertainSample
 from tfbus.links.ros.messages import (
     as_mapping,
     decode_clock,
@@ -152,9 +155,37 @@ def test_odometry_is_the_transform_of_its_pose_in_every_encoding() -> None:
     position, turn = row["transform"]["translation"], row["transform"]["rotation"]
     message = {**row, "pose": {"pose": {"position": position, "orientation": turn}}}
     assert decode_odometry(message, ros1=False) == ([sample], [])
-    for content in (odometry(sample)[:60], {}, {**message, "pose": {}}, 5):
+    for content in (odometry(sample)[:60], odometry(sample)[:300], {}, {**message, "pose": {}}, 5):
         with pytest.raises(MalformedMessageError):
             decode_odometry(content, ros1=False)
+
+
+KNOWN = random_covariance(np.random.default_rng(1), 0.1, 0.05).ravel()
+
+
+def test_a_covariance_of_odometry_that_is_known_comes_as_that_of_a_drift_in_every_encoding() -> None:
+    sample = TransformStamped("odom", "base", 7, SAMPLES[1].transform)
+    in_ros2 = odometry(sample, covariance=KNOWN)
+    row = as_mapping(sample)
+    pose = {"position": row["transform"]["translation"], "orientation": row["transform"]["rotation"]}
+    for found in (
+        decode_odometry(in_ros2, ros1=False),
+        decode_odometry(odometry(sample, little_endian=False, covariance=KNOWN), ros1=False),
+        decode_odometry(bytes(TYPES.cdr_to_ros1(in_ros2, ODOMETRY)), ros1=True),
+        decode_odometry({**row, "pose": {"pose": pose, "covariance": KNOWN.tolist()}}, ros1=False),
+    ):
+        (decoded,) = found.samples
+        assert (decoded, found.errors) == (sample, [])
+        assert isinstance(decoded, UncertainSample)
+        assert decoded.kind == "drift"
+        assert np.array_equal(decoded.covariance.matrix.ravel(), KNOWN)
+    unknown: list[Any] = [[0.0] * 36, [-1.0, *KNOWN[1:]], [1e6, *KNOWN[1:]], [math.nan] * 36, [None] * 36, KNOWN[:35]]
+    unknown += [{}, "guess", [10**400] * 36, None]
+    for covariance in unknown:
+        found = decode_odometry({**row, "pose": {"pose": pose, "covariance": covariance}}, ros1=False)
+        (decoded,) = found.samples
+        assert (decoded, found.errors) == (sample, [])
+        assert not isinstance(decoded, UncertainSample)
 
 
 KIND = "rosgraph_msgs/msg/Clock"

@@ -2,13 +2,25 @@ import struct
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import pytest
 from support.joint_messages import joint_state, odometry
 from support.processes import until
 from support.ros import ListCarrier, RosEnd, named
 from support.samples import moving, static
+from support.worlds import random_covariance
 
-from tfbus import Bus, PeerRejected, SimulatedClock, Transform, TransformStamped, from_seconds
+from tfbus import (
+    Bus,
+    Covariance,
+    PeerRejected,
+    SimulatedClock,
+    Transform,
+    TransformStamped,
+    UncertainSample,
+    from_seconds,
+)
+from tfbus.geometry.covariance import inverse_jacobian
 from tfbus.links.ros import RosLink, RosOptions
 from tfbus.links.ros.ros_link import MOST_TRANSFORMS, RosMessage
 from tfbus.links.ros.settings import Other, as_topics
@@ -317,10 +329,17 @@ def test_positions_of_joints_are_handed_on_and_what_comes_of_that_is_counted() -
 def test_odometry_is_a_transform_of_its_topic_and_may_be_inverted(invert: bool) -> None:
     pose = Transform.from_xyz_rpy((1.0, -2.0, 0.5), (0.1, 0.2, 0.3))
     end = RosEnd(odometry="/odom", invert=invert, prefix="r/")
-    for payload in (odometry(TransformStamped("odom", "base", 5, pose)), b"garbage"):
+    error = Covariance(random_covariance(np.random.default_rng(1), 0.1, 0.05))
+    of_pose = odometry(TransformStamped("odom", "base", 5, pose), covariance=error.matrix.ravel())
+    for payload in (of_pose, b"garbage"):
         end.carrier.hear(RosMessage(payload, static=False, authority="/odom", other="odometry"))
     expected = TransformStamped("r/odom", "r/base", 5, pose, "/odom")
     if invert:
         expected = TransformStamped("r/base", "r/odom", 5, pose.inverse(), "/odom")
     assert end.heard == [(expected,)]
+    (sample,) = end.heard[0]
+    assert isinstance(sample, UncertainSample)
+    jacobian = inverse_jacobian(pose) if invert else np.eye(6)
+    assert sample.covariance.matrix == pytest.approx(jacobian @ error.matrix @ jacobian.T)
+    assert sample.kind == ("independent" if invert else "drift")
     assert end.endpoint.rejected == {"truncated": 1}

@@ -18,7 +18,7 @@ from support.rosbridge import install_roslib, joined, rosbridge_server, roslib_c
 from support.samples import moving, static
 from wsproto.events import TextMessage
 
-from tfbus import Bus, PeerLost, PeerRejected, SimulatedClock
+from tfbus import Bus, Covariance, PeerLost, PeerRejected, SimulatedClock
 from tfbus._aio.websocket import WebSocket
 from tfbus.links.ros import RosOptions
 from tfbus.links.ros.messages import as_mapping
@@ -206,7 +206,8 @@ async def test_odometry_comes_as_fields_and_as_bytes_of_either_ros() -> None:
     row = as_mapping(moved[0])
     pose = {"position": row["transform"]["translation"], "orientation": row["transform"]["rotation"]}
     of_ros2 = [odometry(sample) for sample in moved[1:]]
-    contents = [{**row, "pose": {"pose": pose}}, {"bytes": of_ros2[0]}]
+    numbers = cbor2.CBORTag(86, Covariance.of(xyz=0.1).matrix.tobytes())
+    contents = [{**row, "pose": {"pose": pose, "covariance": numbers}}, {"bytes": of_ros2[0]}]
     contents.append({"bytes": bytes(TYPES.cdr_to_ros1(of_ros2[1], ODOMETRY))})
     heard: list[Any] = []
     async with joined(odometry="/odom") as (server, bus, link):
@@ -216,6 +217,8 @@ async def test_odometry_comes_as_fields_and_as_bytes_of_either_ros() -> None:
             await server.say_anything(cbor2.dumps({"op": "publish", "topic": "/odom", "msg": content}))
         await until(lambda: heard == moved)
         assert link.statistics().rejected == {}
+    assert heard[0].covariance == Covariance.of(xyz=0.1)
+    assert all((sample.covariance.matrix == 7.0).all() for sample in heard[1:])
 
 
 @pytest.mark.parametrize(("encoding", "joints"), [("cbor", "none"), ("cbor-raw", "cbor-raw")])

@@ -9,7 +9,7 @@ from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.endpoint import Endpoint
 from tfbus.links.relay import Peer
-from tfbus.links.replica import MANY_ORIGINS, Entry, Provenance, ReceivedTransform, RemovedFrame
+from tfbus.links.replica import MANY_ORIGINS, Entry, FromLink, Provenance, RemovedFrame
 from tfbus.links.seams import Received, SendReport
 
 
@@ -39,7 +39,7 @@ class ReceivedMessage:
 
     Attributes
     ----------
-    samples : list of ReceivedTransform
+    samples : sequence of FromLink
         They are published as one batch.
     errors : list of InvalidTransformError
         One for each sample that was refused; `samples` has the others.
@@ -49,7 +49,7 @@ class ReceivedMessage:
         Whether it is a later part of a message that was counted.
     """
 
-    samples: list[ReceivedTransform]
+    samples: Sequence[FromLink]
     errors: list[InvalidTransformError] = field(default_factory=list)
     time: int | None = None
     continues: bool = False
@@ -228,7 +228,7 @@ class ForeignEnd(Endpoint):
         if self._admit_authorities(peer, message.samples):
             self._publish(peer, [one for one in message.samples if self.frames is None or one.child in self.frames])
 
-    def _publish(self, peer: Peer, samples: Sequence[ReceivedTransform]) -> None:
+    def _publish(self, peer: Peer, samples: Sequence[FromLink]) -> None:
         """Publish those samples that did not go over this bus before, within the bounds on frames."""
         source, news, refused = self._source(peer), [], 0
         known = self.relay.replica.entries
@@ -240,7 +240,7 @@ class ForeignEnd(Endpoint):
                 refused += 1
                 continue
             peer.frames.add(sample.child)
-            sample._provenance = source
+            sample._provenance = source  # type: ignore[misc]
             news.append(sample)
         if news:
             self.bus.publish(news, invalid="drop")

@@ -9,14 +9,17 @@ error beside the others. Anything else that is wrong makes the message malformed
 """
 
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from itertools import islice
 from typing import Any
 
 from tfbus.errors import InvalidTransformError
+from tfbus.geometry.covariance import Covariance
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
-from tfbus.links.replica import ReceivedTransform
+from tfbus.geometry.uncertain import Belief, with_belief
+from tfbus.links.replica import FromLink, ReceivedTransform, received
 from tfbus.stamps import SECOND
 from tfbus.tf_message import MAX_NAME, Decoded, FieldReader, MalformedMessageError
 
@@ -58,8 +61,20 @@ def decode_mapping(message: object) -> Decoded[ReceivedTransform]:
         raise MalformedMessageError("encoding", f"it has not the fields of a TFMessage: {error!r}"[:200]) from None
 
 
-def decode_odometry(content: object, ros1: bool) -> Decoded[ReceivedTransform]:
+def decode_odometry(
+    content: object, ros1: bool, doubles: Callable[[Any], Any] = lambda value: value
+) -> Decoded[FromLink]:
     """The transform of a ``nav_msgs/Odometry``, in bytes or as a mapping: its pose, from its frame to its child.
+
+    A covariance that is known comes along, as that of a drift.
+
+    Parameters
+    ----------
+    content : bytes or mapping
+    ros1 : bool
+        Whether bytes are those of ROS 1.
+    doubles : callable
+        Makes numbers of an array in a mapping.
 
     Raises
     ------
@@ -70,16 +85,27 @@ def decode_odometry(content: object, ros1: bool) -> Decoded[ReceivedTransform]:
         if isinstance(content, bytes):
             fields = FieldReader(content, ros1)
             stamp, parent = fields.header()
-            child, numbers = fields.text(), fields.doubles(7)
-            return _decoded([(_text(parent), _text(child), stamp // SECOND, stamp % SECOND, numbers)])
+            child, numbers, variances = fields.text(), fields.doubles(7), fields.doubles(36)
+            plain = _decoded([(_text(parent), _text(child), stamp // SECOND, stamp % SECOND, numbers)])
+            return _drifting(plain, variances)
         message: Any = content
         pose = message["pose"]["pose"]
         transform = {"translation": pose["position"], "rotation": pose["orientation"]}
-        return _decoded(_parts_of_mapping({"transforms": [{**message, "transform": transform}]}))
+        plain = _decoded(_parts_of_mapping({"transforms": [{**message, "transform": transform}]}))
+        return _drifting(plain, doubles(message["pose"].get("covariance")))
     except struct.error:
-        raise MalformedMessageError("truncated", "it ends before the pose does") from None
+        raise MalformedMessageError("truncated", "it ends before the covariance of its pose does") from None
     except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise MalformedMessageError("encoding", f"it has not the fields of an Odometry: {error!r}"[:200]) from None
+
+
+def _drifting(decoded: Decoded[ReceivedTransform], covariance: Any) -> Decoded[FromLink]:
+    """Samples with the covariance of odometry; without it if it is unknown, as JSON has null for what is no number."""
+    samples: list[FromLink | None] = list(decoded.samples)
+    with suppress(TypeError, ValueError, OverflowError):
+        if (known := Covariance.from_ros(covariance)) is not None:
+            samples = [sample and received(with_belief(sample, Belief(known, "drift"))) for sample in samples]
+    return Decoded(samples, decoded.errors)
 
 
 def decode_ros1_in_parts(payload: bytes, most: int) -> Iterator[Decoded[ReceivedTransform]]:

@@ -17,7 +17,7 @@ from tfbus.bus.bus import Bus
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.link import Link
-from tfbus.links.replica import OutgoingBatch, ReceivedTransform
+from tfbus.links.replica import FromLink, OutgoingBatch, ReceivedTransform, received
 from tfbus.links.ros.foreign_end import Carrier, ForeignEnd, ReceivedMessage, Turn
 from tfbus.links.ros.messages import decode_clock, decode_odometry, decode_text
 from tfbus.links.ros.settings import Other, RosOptions, RosSettings
@@ -137,14 +137,14 @@ class RosCarrier(Carrier, ABC):
                 self.settings.robot_description(description)
             return ReceivedMessage([])
         if content.other == "odometry":
-            decoded = self._decode_odometry(content.payload)
+            decoded: Decoded[Any] = self._decode_odometry(content.payload)
             if self.settings.invert:
-                decoded.samples[:] = [sample and _inverse(sample) for sample in decoded.samples]
+                decoded.samples[:] = [sample and received(sample.inverse()) for sample in decoded.samples]
         else:
             decoded = content.payload if isinstance(content.payload, Decoded) else self._decode(content.payload)
         self._heard(decoded.samples, content.static)
         errors = decoded.errors
-        samples: list[ReceivedTransform] = []
+        samples: list[FromLink] = []
         authority = content.authority if self.settings.authority is None else self.settings.authority
         for error in errors:
             error.authority = authority
@@ -187,14 +187,14 @@ class RosCarrier(Carrier, ABC):
         """The transforms of a large message, `PART` at a time; raises `MalformedMessageError` at the first fault."""
         return decode_in_parts(payload, PART, ReceivedTransform, bare_names=True)
 
-    def _heard(self, samples: Sequence[ReceivedTransform | None], static: bool) -> None:
+    def _heard(self, samples: Sequence[FromLink | None], static: bool) -> None:
         """Take note of transforms by their names in ROS."""
 
     def _decode_joints(self, payload: Any) -> tuple[int, dict[str, float]]:
         """The stamp and the positions of joints of a message; raises `MalformedMessageError`."""
         return decode_joint_state(payload, ros1=False)
 
-    def _decode_odometry(self, payload: Any) -> Decoded[ReceivedTransform]:
+    def _decode_odometry(self, payload: Any) -> Decoded[FromLink]:
         """The transform of odometry; raises `MalformedMessageError`."""
         return decode_odometry(payload, ros1=False)
 
@@ -230,10 +230,6 @@ class RosCarrier(Carrier, ABC):
                 error = no_name.with_traceback(None)
         self._report.refused(error.reason, error)
         return None
-
-
-def _inverse(sample: ReceivedTransform) -> ReceivedTransform:
-    return ReceivedTransform(sample.child, sample.parent, sample.stamp, sample.transform.inverse())
 
 
 class RosLink(Link):
@@ -272,7 +268,7 @@ class RosLink(Link):
         The topic of that, by default ``/robot_description``.
     odometry : str or iterable of str, optional
         Topics of ``nav_msgs/Odometry``: the pose of each message is a moving transform, from its frame to its child,
-        with the topic as its authority.
+        with the topic as its authority, and with its covariance if that is known, as a drift.
     invert : bool
         Whether the child of odometry becomes the parent, because it has a parent already.
     clock : SimulatedClock, optional

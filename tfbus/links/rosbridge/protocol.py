@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple, NoReturn, TypeVar
 import cbor2
 
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.replica import ReceivedTransform
+from tfbus.links.replica import FromLink, ReceivedTransform
 from tfbus.links.ros.messages import (
     as_mapping,
     decode_mapping,
@@ -448,9 +448,18 @@ def _of_either(content: bytes, decode_bytes: Callable[[bytes, bool], T]) -> T:
     return decode_bytes(content, True)
 
 
-def decode_odometry_of(content: Any) -> Decoded[ReceivedTransform]:
+def decode_odometry_of(content: Any) -> Decoded[FromLink]:
     """The transform of odometry, in bytes of either ROS or as a mapping; raises `MalformedMessageError`."""
-    return _of_either(content, decode_odometry) if isinstance(content, bytes) else decode_odometry(content, ros1=False)
+    if isinstance(content, bytes):
+        return _of_either(content, decode_odometry)
+    return decode_odometry(content, ros1=False, doubles=_doubles)
+
+
+def _doubles(array: Any) -> Any:
+    """The numbers of an array of float64 in CBOR; any other value itself."""
+    if isinstance(array, cbor2.CBORTag) and array.tag == _DOUBLES:
+        return memoryview(array.value).cast("B").cast("d")
+    return array
 
 
 def decode_joints(content: Any) -> tuple[int, dict[str, float]]:
@@ -464,9 +473,8 @@ def decode_joints(content: Any) -> tuple[int, dict[str, float]]:
     if isinstance(content, bytes):
         return _of_either(content, decode_joint_state)
     try:
-        stamp, names, positions = stamp_of(content["header"]["stamp"]), content["name"], content["position"]
-        if isinstance(positions, cbor2.CBORTag) and positions.tag == _DOUBLES:
-            positions = memoryview(positions.value).cast("B").cast("d")
+        stamp, names = stamp_of(content["header"]["stamp"]), content["name"]
+        positions = _doubles(content["position"])
         if len(positions) < len(names):
             raise MalformedMessageError("positions", f"there are {len(names)} names, and {len(positions)} positions")
         return stamp, {str(name): float(position) for name, position in zip(names, positions, strict=False)}

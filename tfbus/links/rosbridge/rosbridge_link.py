@@ -36,7 +36,7 @@ from tfbus._aio.task_groups import close_task_group
 from tfbus._aio.websocket import WebSocket, check_url
 from tfbus.bus.bus import Bus
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.replica import ReceivedTransform
+from tfbus.links.replica import FromLink, ReceivedTransform
 from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
 from tfbus.links.ros.settings import RosOptions, RosSettings, settings_of
 from tfbus.links.rosbridge.protocol import (
@@ -260,7 +260,7 @@ class RosbridgeCarrier(RosCarrier):
     def _decode(self, payload: Any) -> Decoded[ReceivedTransform]:
         return decode_content(payload)
 
-    def _heard(self, samples: Sequence[ReceivedTransform | None], static: bool) -> None:
+    def _heard(self, samples: Sequence[FromLink | None], static: bool) -> None:
         if static:
             self._confirmation.heard(samples)
 
@@ -273,7 +273,7 @@ class RosbridgeCarrier(RosCarrier):
     def _decode_joints(self, payload: Any) -> tuple[int, dict[str, float]]:
         return decode_joints(payload)
 
-    def _decode_odometry(self, payload: Any) -> Decoded[ReceivedTransform]:
+    def _decode_odometry(self, payload: Any) -> Decoded[FromLink]:
         return decode_odometry_of(payload)
 
     async def _talk(self, socket: WebSocket) -> None:
