@@ -266,6 +266,7 @@ class Synchronizer(AsyncOnly):
         self._error: BaseException | None = None
         self._reader = OneReader()
         self._room = anyio.Event()
+        self._warn_unless_entered()
 
     @property
     def delivered(self) -> int:
@@ -278,8 +279,7 @@ class Synchronizer(AsyncOnly):
         return tuple(counts.copy() for counts in self._counts)
 
     async def __aenter__(self) -> "Synchronizer":
-        if self._tasks is not None:
-            raise RuntimeError("a synchronizer is entered once: make another one")
+        self._enter_once()
         self._tasks = await anyio.create_task_group().__aenter__()
         for number, stream in enumerate(self._streams):
             self._tasks.start_soon(self._read, number, stream)

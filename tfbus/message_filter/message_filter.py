@@ -505,6 +505,7 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
         self._due: dict[PendingMessage[MessageT, AnswerT], None] = {}
         self._reader = OneReader()
         self._room: anyio.Event | None = None
+        self._warn_unless_entered()
 
     @property
     def arrived(self) -> int:
@@ -564,8 +565,7 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
             self._make_due(pending)
 
     async def __aenter__(self) -> "MessageFilter[MessageT, AnswerT]":
-        if self._tasks is not None:
-            raise RuntimeError("a message filter is entered once: make another one")
+        self._enter_once()
         self.buffer.bus._check_thread()
         self._tasks = await anyio.create_task_group().__aenter__()
         source = anyio.CancelScope()
