@@ -49,7 +49,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "synchronizer": ("buffer",),
     "analysis": ("tree",),
     "recording": ("analysis", "robot", "tf_message"),
-    "view": ("buffer", "recording", "robot"),
+    "view": ("links", "recording"),
     "plot": ("recording",),
     "testing": ("geometry",),
     "web": (),

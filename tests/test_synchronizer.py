@@ -1,5 +1,6 @@
 """Sets of messages with nearly the same stamps: beside all sets that there are, and streams that fail and stop."""
 
+import asyncio
 from collections.abc import AsyncIterator, Sequence
 from itertools import product
 from random import Random
@@ -182,6 +183,21 @@ async def test_an_error_of_a_stream_is_raised_after_the_sets_that_are_ready() ->
             got.append(await anext(sets))
             await anext(sets)
     assert len(got) == 1
+
+
+def test_a_stream_that_is_cancelled_by_itself_ends_the_sets_but_not_the_body() -> None:
+    async def cancelled() -> AsyncIterator[Message]:
+        yield Message(5)
+        raise asyncio.CancelledError
+
+    async def main() -> None:
+        async with Synchronizer(replay([5, 9]), cancelled(), within=1.0) as sets:
+            assert [each.stamp for each in await anext(sets)] == [5, 5]
+            with pytest.raises(asyncio.CancelledError):
+                await anext(sets)
+            await asyncio.sleep(0)
+
+    asyncio.run(main())
 
 
 async def test_a_set_comes_with_its_transforms_or_is_dropped_and_a_cancelled_reader_loses_none() -> None:

@@ -4,7 +4,7 @@ import logging
 import os
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, NoReturn
+from typing import NoReturn
 from weakref import finalize
 
 
@@ -57,7 +57,18 @@ class Registration:
 
 
 class AsyncOnly:
-    """A base of classes that own a task or a socket: a plain ``with`` raises a `TypeError` that says ``async with``."""
+    """A base of classes that own a task or a socket, and so are entered once, by ``async with``.
+
+    A plain ``with`` raises a `TypeError`. When an object that nobody has entered is deleted, a line of log says so. The
+    constructor ends with `_warn_unless_entered`, and ``__aenter__`` calls `_enter_once`.
+    """
+
+    def _warn_unless_entered(self) -> None:
+        self._never_entered = finalize(self, _warn_never_entered, type(self).__name__, os.getpid())
+
+    def _enter_once(self) -> None:
+        if self._never_entered.detach() is None:
+            raise RuntimeError(f"a {type(self).__name__} is entered once: make another one")
 
     def _refuse_with(self, *_: object) -> NoReturn:
         name = type(self).__name__
@@ -65,11 +76,6 @@ class AsyncOnly:
 
     # Type checkers should not take it for something that has a `with`.
     vars().update(__enter__=_refuse_with, __exit__=_refuse_with)
-
-
-def warn_unless_entered(thing: object) -> "finalize[..., Any]":
-    """Log a line when an object that nobody has entered is deleted; its ``async with`` calls `detach` of the result."""
-    return finalize(thing, _warn_never_entered, type(thing).__name__, os.getpid())
 
 
 def _warn_never_entered(name: str, process: int) -> None:

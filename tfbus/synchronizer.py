@@ -17,7 +17,7 @@ ROS's message_filters, with an age penalty of zero:
 """
 
 from collections import Counter, deque
-from collections.abc import AsyncGenerator, AsyncIterable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterable, Callable, Iterator, Sequence
 from operator import attrgetter
 from types import TracebackType
 from typing import Any, Literal, NamedTuple
@@ -26,7 +26,7 @@ import anyio
 import anyio.abc
 
 from tfbus._aio.loops import checkpoint
-from tfbus._aio.task_groups import OneReader, close_task_group, raise_unchanged
+from tfbus._aio.task_groups import OneReader, close_task_group, raise_unchanged, read_source
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.queues import check_capacity
 from tfbus.errors import TransformError
@@ -266,6 +266,7 @@ class Synchronizer(AsyncOnly):
         self._error: BaseException | None = None
         self._reader = OneReader()
         self._room = anyio.Event()
+        self._warn_unless_entered()
 
     @property
     def delivered(self) -> int:
@@ -278,8 +279,7 @@ class Synchronizer(AsyncOnly):
         return tuple(counts.copy() for counts in self._counts)
 
     async def __aenter__(self) -> "Synchronizer":
-        if self._tasks is not None:
-            raise RuntimeError("a synchronizer is entered once: make another one")
+        self._enter_once()
         self._tasks = await anyio.create_task_group().__aenter__()
         for number, stream in enumerate(self._streams):
             self._tasks.start_soon(self._read, number, stream)
@@ -347,22 +347,16 @@ class Synchronizer(AsyncOnly):
         return tuple(found)
 
     async def _read(self, number: int, stream: AsyncIterable[Any]) -> None:
-        try:
+        async def take(message: Any) -> None:
+            self._accept(number, message)
             await checkpoint()
-            messages = aiter(stream)
-            try:
-                async for message in messages:
-                    self._accept(number, message)
-                    await checkpoint()
-                    while self._block and (
-                        len(self._matching.queues[number]) >= self._capacity or len(self._ready) >= self._capacity
-                    ):
-                        await self._room.wait()
-            finally:
-                if isinstance(messages, AsyncGenerator):
-                    await messages.aclose()
-        except Exception as error:  # noqa: BLE001 - the reader raises it
-            self._error = self._error or error
+            while self._block and (
+                len(self._matching.queues[number]) >= self._capacity or len(self._ready) >= self._capacity
+            ):
+                await self._room.wait()
+
+        error = await read_source(stream, take)
+        self._error = self._error or error
         self._matching.end(number)
         self._match()
         self._reader.wake()

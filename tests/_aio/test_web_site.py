@@ -23,6 +23,8 @@ pytestmark = pytest.mark.anyio
 PAGE = WebFile("text/html; charset=utf-8", b"<p>page</p>" * 100_000)
 UPGRADE = b"GET /socket HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
 
+KEY = b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+
 
 async def echo(socket: WebSocket) -> None:
     while True:
@@ -70,12 +72,42 @@ async def test_a_wrong_handshake_is_told(rest: bytes) -> None:
 
 async def test_an_end_that_answers_no_ping_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web_site, "PING_EVERY", 0.01)
-    key = b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
     async with serving() as server, await connect(server) as stream:
-        await stream.send(UPGRADE + key)
+        await stream.send(UPGRADE + KEY)
         with pytest.raises(anyio.EndOfStream):
             while True:
                 await stream.receive()
+
+
+class Stuck(anyio.abc.ByteStream):
+    """Sends the answer to the handshake, and one byte of each message after it."""
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+
+    async def send(self, item: bytes) -> None:
+        self.sent.append(item[:1])
+        if len(self.sent) > 1:
+            await anyio.sleep_forever()
+
+    async def receive(self, _: int = 65_536) -> bytes:
+        raise anyio.EndOfStream
+
+    async def send_eof(self) -> None: ...
+
+    async def aclose(self) -> None: ...
+
+
+@pytest.mark.every_loop
+async def test_nothing_is_sent_after_a_frame_that_was_cut_short() -> None:
+    stream = Stuck()
+    socket = await WebSocket.accept(stream, UPGRADE + KEY, 1_000)
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(socket.ping)
+        await anyio.wait_all_tasks_blocked()
+        tasks.cancel_scope.cancel()
+    await socket.close()
+    assert stream.sent == [b"H", b"\x89"]
 
 
 async def test_connections_have_a_bound_and_the_end_of_one_makes_room() -> None:
@@ -101,9 +133,8 @@ async def test_connections_have_a_bound_and_the_end_of_one_makes_room() -> None:
 async def test_garbage_disturbs_nobody_else(pieces: list[bytes], opened: bool) -> None:
     async with serving() as server:
         async with await connect(server) as stream:
-            key = b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
             try:
-                await stream.send(UPGRADE + key if opened else b"GET ")
+                await stream.send(UPGRADE + KEY if opened else b"GET ")
                 for piece in pieces:
                     await stream.send(piece)
             except anyio.BrokenResourceError:

@@ -18,12 +18,24 @@ import pytest
 from support.asking import settle
 from support.both_sides import URDF
 from support.commands import START, Command, check_wrong_call
-from support.processes import PATIENCE, new_dds_domain, new_domain, start_tfbus
+from support.processes import PATIENCE, new_dds_domain, new_domain, start_tfbus, until
 from support.samples import moving, static
 
-from tfbus import SECOND, Buffer, Bus, ClockResetError, LocalLink, SimulatedClock, TransformStamped, from_seconds
+from tfbus import (
+    SECOND,
+    Buffer,
+    Bus,
+    ClockResetError,
+    LocalLink,
+    SimulatedClock,
+    SystemClock,
+    Transform,
+    TransformBroadcaster,
+    TransformStamped,
+    from_seconds,
+)
 from tfbus.cli.arguments import UsageError
-from tfbus.cli.domain import LinkOptions, RemoteLookups, is_ros, publish_static, ros_link, run
+from tfbus.cli.domain import HearingOptions, LinkOptions, RemoteLookups, is_ros, publish_static, ros_link, run
 from tfbus.cli.replay_clock import ReplayClock
 from tfbus.links import BufferServer
 from tfbus.testing import simulate
@@ -111,6 +123,26 @@ def test_it_is_said_whom_a_program_hears_and_how(
 
     anyio.run(meet)
     assert capsys.readouterr() == ("", f"{said}\n")
+
+
+class Ahead(SystemClock):
+    def now(self) -> int:
+        return super().now() + 3_600 * SECOND
+
+
+@pytest.mark.parametrize(("correct_clocks", "ahead"), [(False, 3_600), (True, 0)])
+def test_stamps_of_another_clock_are_moved_to_that_of_this_machine_if_asked(correct_clocks: bool, ahead: int) -> None:
+    options = HearingOptions(new_domain(), correct_clocks=correct_clocks)
+
+    async def meet() -> None:
+        with Bus() as bus, Bus(Ahead()) as other, Buffer(bus) as buffer:
+            async with options.join(bus) as (link,), LocalLink(other, options.domain):
+                await until(lambda: any(clock.offset for clock in link.statistics().clocks))
+                TransformBroadcaster(other).send("map", "cart", Transform())
+                stamp = (await buffer.lookup("map", "cart", timeout=PATIENCE)).stamp
+                assert abs(bus.clock.now() + ahead * SECOND - stamp) < 60 * SECOND
+
+    anyio.run(meet)
 
 
 @pytest.mark.parametrize(("seconds", "notice"), [(0.9, ""), (60.0, "waiting for transforms on domain 'yard' …\n")])

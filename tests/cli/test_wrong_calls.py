@@ -62,6 +62,8 @@ NEEDS = {
         ("echo '' base_link", "must not be empty"),
         ("echo map base_link --remote --robots r1 --robots r2", "one robot"),
         ("echo map base_link --remote --robots a/b", "robot"),
+        ("echo map base_link --remote --correct-clocks", "with --remote, the other program answers"),
+        ("echo map base_link --ros dds --correct-clocks", "ROS tells no clocks, give --ros-offset"),
         ("echo map base --ros ws://127.0.0.1:1", "cannot join ROS at ws://127.0.0.1:1: "),
         ("bridge ws://127.0.0.1:1 tf", "cannot join ROS at ws://127.0.0.1:1: "),
         *((f"bridge {ends}", "two places") for ends in ("dds dds", "tf domain:tf", "dds dds --connect tcp/a:1")),

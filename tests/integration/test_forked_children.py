@@ -177,10 +177,14 @@ anyio.run(main)
     assert lines[0] in "12"
 
 
-def test_each_link_that_was_made_and_never_entered_is_told_of_in_one_line_and_no_other() -> None:
+def test_each_object_that_was_made_and_never_entered_is_told_of_in_one_line_and_no_other() -> None:
     program = f"""{BEGIN}
 from tfbus.links.rmw_zenoh import RmwZenohLink
-from tfbus.links.rosbridge import RosbridgeLink
+from tfbus.links.rosbridge import RosbridgeLink, RosbridgeServer
+from tfbus.view import View
+from tfbus import MessageFilter, Synchronizer
+async def messages():
+    yield
 async def enter(link):
     async with link:
         pass
@@ -188,11 +192,14 @@ entered = ZenohLink(Bus(), listen="tcp/127.0.0.1:0")
 anyio.run(enter, entered)
 tell(anyio.run, enter, ZenohLink(Bus(), listen="tcp/192.0.2.1:1"))
 tell(ZenohLink, Bus(), "no domain")
-# One link goes at once, the program keeps five to its end; the copies in a child are not told of again.
+# One link goes at once, the program keeps the others to its end; the copies in a child are not told of again.
 RmwZenohLink(Bus())
 link = LocalLink(Bus())
 kept = [ZenohLink(Bus(), connect="tcp/127.0.0.1:1"), RosbridgeLink(Bus(), "ws://127.0.0.1:9090"), link]
-kept += [BufferServer(Buffer(link.bus), link), ZenohRouter("tcp/127.0.0.1:1")]
+buffer = Buffer(link.bus)
+kept += [BufferServer(buffer, link), ZenohRouter("tcp/127.0.0.1:1"), View(link.bus, buffer), RosbridgeServer(link.bus)]
+kept += [Recorder(link.bus, "never"), MessageFilter(messages(), buffer, "map")]
+kept += [Synchronizer(messages(), messages(), within=1.0)]
 in_a_child(lambda: sys.exit())
 """
     command = [sys.executable, "-P", "-W", "ignore::DeprecationWarning", "-c", program]
@@ -200,5 +207,8 @@ in_a_child(lambda: sys.exit())
     assert [line.split()[0] for line in done.stdout.splitlines()] == ["OSError", "ValueError"]
     assert sorted(done.stderr.splitlines()) == [
         f"a {name} was made and never entered, so it has done nothing: write `async with {name}(...)`"
-        for name in ("BufferServer", "LocalLink", "RmwZenohLink", "RosbridgeLink", "ZenohLink", "ZenohRouter")
+        for name in (
+            *("BufferServer", "LocalLink", "MessageFilter", "Recorder", "RmwZenohLink", "RosbridgeLink"),
+            *("RosbridgeServer", "Synchronizer", "View", "ZenohLink", "ZenohRouter"),
+        )
     ]

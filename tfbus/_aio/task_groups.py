@@ -1,13 +1,16 @@
 """Task groups that belong to an object with an ``async with`` of its own."""
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import AsyncGenerator, AsyncIterable, Awaitable, Callable
 from types import TracebackType
 from typing import Any, Generic, NoReturn, Self, TypeVar
 
 import anyio
 import anyio.abc
 import anyio.lowlevel
+
+from tfbus._aio.loops import checkpoint
 
 ItemT = TypeVar("ItemT")
 
@@ -113,6 +116,29 @@ class OneReaderStream(ABC, Generic[ItemT]):
     async def _wait(self) -> None:
         """Wait until `wake` is called, or until it is time to look again."""
         await self._reader.wait()
+
+
+async def read_source(source: AsyncIterable[ItemT], take: Callable[[ItemT], Awaitable[object]]) -> BaseException | None:
+    """Hand over all items of a source; the error that ended it, if there was one. An async generator is closed.
+
+    A source may also be cancelled by itself, as a task of asyncio can be; this task is not cancelled then.
+    """
+    try:
+        await checkpoint()
+        items = aiter(source)
+        try:
+            async for item in items:
+                await take(item)
+        finally:
+            if isinstance(items, AsyncGenerator):
+                await items.aclose()
+    except anyio.get_cancelled_exc_class() as error:
+        if anyio.current_effective_deadline() == -math.inf:
+            raise
+        return error
+    except Exception as error:  # noqa: BLE001 - the caller has it raised elsewhere
+        return error
+    return None
 
 
 async def close_task_group(tasks: anyio.abc.TaskGroup) -> None:

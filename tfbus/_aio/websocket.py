@@ -77,6 +77,7 @@ class WebSocket:
         self._received: Iterator[Event] = iter(())
         self._budget = TurnBudget()
         self._sending = anyio.Lock()
+        self._cut_short = False
         self.heard: float = anyio.current_time()
 
     @classmethod
@@ -221,7 +222,12 @@ class WebSocket:
             # Its text has the whole message.
             raise ConnectionResetError("the websocket is closed") from None
         async with self._sending:
+            if self._cut_short:
+                raise ConnectionResetError("a frame was cut short")
+            # A cancelled send may have sent a part of the frame, and further bytes would be taken for its rest.
+            self._cut_short = True
             try:
                 await self._stream.send(data)
             except _GONE:
                 raise ConnectionResetError("the connection is gone") from None
+            self._cut_short = False

@@ -118,6 +118,7 @@ class LinkOptions:
     # Options of `HearingOptions`, or of the command itself.
     odometry: Annotated[tuple[str, ...], Parameter(parse=False)] = ()
     invert: Annotated[Flag, Parameter(parse=False)] = False
+    correct_clocks: Annotated[Flag, Parameter(parse=False)] = False
 
     @property
     def place(self) -> str:
@@ -209,6 +210,8 @@ class LinkOptions:
             raise UsageError("--odometry is for ROS: give --ros, such as --ros dds")
         if self.invert and not self.odometry:
             raise UsageError("--invert is for the topics of --odometry: give one")
+        if self.ros and self.correct_clocks:
+            raise UsageError("--correct-clocks is for a domain: ROS tells no clocks, give --ros-offset")
         if self.ros:
             async with AsyncExitStack() as stack:
                 links = []
@@ -225,6 +228,7 @@ class LinkOptions:
             "robots": self.robots or None,
             "clock": follower,
             "tell_clock": isinstance(bus.clock, SimulatedClock),
+            "correct_clocks": self.correct_clocks,
         }
         async with self._entered(bus, options) as link:
             yield [link]
@@ -255,6 +259,8 @@ class LinkOptions:
         """
         if len(self.robots) > 1:
             raise UsageError("--remote asks the buffer of one robot: give --robots once")
+        if self.correct_clocks:
+            raise UsageError("--correct-clocks moves stamps as they arrive: with --remote, the other program answers")
         # With the rate 0, the link learns who is there and receives no transforms.
         options: DomainOptions = {"robots": dict.fromkeys(self.robots or ("*",), 0.0)}
 
@@ -317,10 +323,13 @@ class HearingOptions(LinkOptions):
         With --ros, a topic of nav_msgs/Odometry whose poses are transforms too; may be given several times.
     invert
         Make the child of the odometry the parent, because it has a parent already.
+    correct_clocks
+        Move the stamps of other programs to the clock of this machine, by the offsets that the link measures.
     """
 
     odometry: tuple[str, ...] = ()
     invert: Flag = False
+    correct_clocks: Flag = False
 
 
 DEFAULT_LINK = LinkOptions()

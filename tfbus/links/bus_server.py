@@ -1,4 +1,4 @@
-"""`BusServer`, what the servers that show a bus to web pages have in common: one address, and a door."""
+"""`BusServer`, the common part of all servers that show a bus to web pages: one address, and a door."""
 
 from collections.abc import Iterable
 from types import TracebackType
@@ -8,7 +8,7 @@ from tfbus._aio.web_door import WebDoor
 from tfbus._aio.web_server import Answer, WebServer
 from tfbus.bus.bus import Bus
 from tfbus.errors import BusClosedError
-from tfbus.registration import AsyncOnly, warn_unless_entered
+from tfbus.registration import AsyncOnly
 
 
 class BusServer(AsyncOnly):
@@ -21,14 +21,19 @@ class BusServer(AsyncOnly):
         As for `WebServer` and `WebDoor`.
     answer : callable
         The `Answer` of the `WebServer`.
+    search : bool
+        As for `WebServer`.
     """
 
-    def __init__(self, bus: Bus, host: str, port: int, origins: Iterable[str], answer: Answer) -> None:
+    _scheme = "ws"
+
+    def __init__(
+        self, bus: Bus, host: str, port: int, origins: Iterable[str], answer: Answer, search: bool = False
+    ) -> None:
         self.bus = bus
         self.address: str = ""
-        self._front = WebServer(host, port, WebDoor(host, origins), answer)
-        self._entered = False
-        self._never_entered = warn_unless_entered(self)
+        self._front = WebServer(host, port, WebDoor(host, origins), answer, search)
+        self._warn_unless_entered()
 
     @property
     def refused(self) -> int:
@@ -36,21 +41,18 @@ class BusServer(AsyncOnly):
         return self._front.refused
 
     async def __aenter__(self) -> Self:
-        if self._entered:
-            raise RuntimeError("a server is entered once: make another one")
+        self._enter_once()
         self.bus._check_thread()
         if self.bus.closed:
             raise BusClosedError
-        self._entered = True
         self.bus._entered.add(self)
-        self._never_entered.detach()
         try:
             await self._open()
             await self._front.__aenter__()
         except BaseException:
             await self._stop()
             raise
-        self.address = f"ws://{self._front.place}"
+        self.address = f"{self._scheme}://{self._front.place}"
         return self
 
     async def __aexit__(

@@ -24,7 +24,7 @@ from tfbus.links.endpoint import Endpoint, HearsTime
 from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import RemoteQuestion
 from tfbus.links.seams import Left, Received, Wire
-from tfbus.registration import AsyncOnly, Registration, warn_unless_entered
+from tfbus.registration import AsyncOnly, Registration
 from tfbus.stamps import LATEST, AtLike, as_at, as_duration, from_seconds, to_seconds
 from tfbus.statistics import LinkStatistics, QueueStatistics
 from tfbus.tf_message import MalformedMessageError
@@ -266,10 +266,9 @@ class Link(AsyncOnly):
         self._budget = TurnBudget() if budget is None else budget
         self._received = LoopWaker(self._handle_received)
         self._turn_ends = LoopWaker(end.send)
-        self._entered = False
         self._attached = False
         self._tasks: anyio.abc.TaskGroup | None = None
-        self._never_entered = warn_unless_entered(self)
+        self._warn_unless_entered()
 
     @property
     def peers(self) -> tuple[str, ...]:
@@ -307,18 +306,15 @@ class Link(AsyncOnly):
         )
 
     async def __aenter__(self) -> Self:
-        if self._entered:
-            if self._attached:
-                self._check_loop()
-            raise RuntimeError("a link is entered once: make another one")
+        if self._attached:
+            self._check_loop()
         self.bus._check_thread()
         if self.bus.closed:
             raise BusClosedError
         for other in self.bus._entered:
             if isinstance(other, Link):
                 other._check_loop()
-        self._entered = True
-        self._never_entered.detach()
+        self._enter_once()
         for waker in (self._received, self._turn_ends):
             waker.bind()
         try:

@@ -33,7 +33,7 @@ from tfbus.links.message import (
     write_body,
     write_question,
 )
-from tfbus.registration import AsyncOnly, warn_unless_entered
+from tfbus.registration import AsyncOnly
 from tfbus.statistics import BufferServerStatistics
 from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.lookup import Hold
@@ -282,13 +282,12 @@ class BufferServer(AsyncOnly):
         self._rate = rate
         self._allowance = self._most_at_once = max(rate, 1.0)
         self._refilled = monotonic()
-        self._entered = False
-        self._never_entered = warn_unless_entered(self)
         self._waiting: dict[tuple[str, int], anyio.CancelScope] = {}
         self._counts: Counter[str] = Counter()
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._lookups: RemoteLookups
         self._tasks: anyio.abc.TaskGroup | None = None
+        self._warn_unless_entered()
 
     def statistics(self) -> BufferServerStatistics:
         """All counters, as they are now.
@@ -315,13 +314,10 @@ class BufferServer(AsyncOnly):
         )
 
     async def __aenter__(self) -> Self:
-        if self._entered:
-            raise RuntimeError("a buffer server is entered once: make another one")
+        self._enter_once()
         self._lookups = self._link.lookups
-        self._never_entered.detach()
         if self._lookups.server is not None:
             raise RuntimeError("this link serves a buffer already")
-        self._entered = True
         self._tasks = await anyio.create_task_group().__aenter__()
         self._link.serve(self)
         return self

@@ -30,7 +30,7 @@ import math
 import warnings
 from bisect import bisect_left, insort
 from collections import Counter
-from collections.abc import AsyncGenerator, AsyncIterable, Callable, Sequence
+from collections.abc import AsyncIterable, Callable, Sequence
 from functools import partial
 from inspect import iscoroutinefunction
 from itertools import count
@@ -43,7 +43,7 @@ import anyio.abc
 import anyio.lowlevel
 
 from tfbus._aio.loops import checkpoint
-from tfbus._aio.task_groups import OneReader, close_task_group, raise_unchanged
+from tfbus._aio.task_groups import OneReader, close_task_group, raise_unchanged, read_source
 from tfbus.buffer.buffer import Buffer
 from tfbus.buffer.lookups import Wait
 from tfbus.bus.queues import check_capacity
@@ -505,6 +505,7 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
         self._due: dict[PendingMessage[MessageT, AnswerT], None] = {}
         self._reader = OneReader()
         self._room: anyio.Event | None = None
+        self._warn_unless_entered()
 
     @property
     def arrived(self) -> int:
@@ -564,8 +565,7 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
             self._make_due(pending)
 
     async def __aenter__(self) -> "MessageFilter[MessageT, AnswerT]":
-        if self._tasks is not None:
-            raise RuntimeError("a message filter is entered once: make another one")
+        self._enter_once()
         self.buffer.bus._check_thread()
         self._tasks = await anyio.create_task_group().__aenter__()
         source = anyio.CancelScope()
@@ -619,34 +619,20 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
     async def _read_source(self, scope: anyio.CancelScope) -> None:
         try:
             with scope:
-                await checkpoint()
-                messages = aiter(self._messages)
-                try:
-                    async for message in messages:
-                        self._accept(message)
-                        await checkpoint()
-                        while self._overflow == "block" and self._pending.full:
-                            await self._wait_for_room()
-                finally:
-                    if isinstance(messages, AsyncGenerator):
-                        await messages.aclose()
-        except anyio.get_cancelled_exc_class() as error:
-            if anyio.current_effective_deadline() == -math.inf:
-                raise
-            # This task was not cancelled: the source itself was, as a task of asyncio can be.
-            self._error = error
-        except Exception as error:  # noqa: BLE001 - the reader raises it
-            self._error = error
+                self._error = await read_source(self._messages, self._take)
         finally:
             self._exhausted = True
             self._wake()
 
-    async def _wait_for_room(self) -> None:
-        self._room = anyio.Event()
-        try:
-            await self._room.wait()
-        finally:
-            self._room = None
+    async def _take(self, message: MessageT) -> None:
+        self._accept(message)
+        await checkpoint()
+        while self._overflow == "block" and self._pending.full:
+            self._room = anyio.Event()
+            try:
+                await self._room.wait()
+            finally:
+                self._room = None
 
     def _accept(self, message: MessageT) -> None:
         frame, stamp = self._frame(message), self._stamp(message)

@@ -148,6 +148,7 @@ class Recorder(AsyncOnly):
         self._dropping = False
         self._ended = False
         self._flushes: list[anyio.Event] = []
+        self._warn_unless_entered()
         self._arrived: anyio.Event
         self._urgent: anyio.Event
         self._threads: anyio.CapacityLimiter
@@ -208,8 +209,7 @@ class Recorder(AsyncOnly):
         await flushed.wait()
 
     async def __aenter__(self) -> "Recorder":
-        if self._registration is not None:
-            raise RuntimeError("a recorder is entered once: make another one")
+        self._enter_once()
         self._arrived = anyio.Event()
         self._urgent = anyio.Event()
         self._registration = self.bus.subscribe(self._enqueue)

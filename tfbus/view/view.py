@@ -14,8 +14,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import anyio
 import anyio.abc
@@ -23,8 +22,6 @@ import anyio.to_thread
 import numpy as np
 
 from tfbus._aio.task_groups import close_task_group
-from tfbus._aio.web_door import WebDoor
-from tfbus._aio.web_server import WebServer
 from tfbus._aio.web_site import WebFile, WebSite
 from tfbus._aio.websocket import WebSocket
 from tfbus.analysis.arrivals import Delays
@@ -32,12 +29,12 @@ from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import OnceLogger
 from tfbus.data import PointCloud
-from tfbus.errors import BusClosedError, TransformError
+from tfbus.errors import TransformError
 from tfbus.events import FrameAdded
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import Batch
+from tfbus.links.bus_server import BusServer
 from tfbus.recording.static_frames import save_static
-from tfbus.registration import AsyncOnly
 from tfbus.robot.model import read_visuals
 from tfbus.stamps import Latest, as_duration, is_real
 from tfbus.statistics import QueueStatistics
@@ -95,7 +92,7 @@ class _Viewer:
                     await self.has_room.wait()
 
 
-class View(AsyncOnly):
+class View(BusServer):
     """A page in the browser that shows the frames of a buffer: ``async with View(bus, buffer) as view``.
 
     It shows the axes of every frame that is connected with the fixed frame, and a line to its parent in the colour of
@@ -155,6 +152,8 @@ class View(AsyncOnly):
         On entering, if the bus is closed; if it belongs to another thread, or the view was entered before.
     """
 
+    _scheme = "http"
+
     def __init__(
         self,
         bus: Bus,
@@ -177,10 +176,6 @@ class View(AsyncOnly):
         for name, frames in (("trails", trails), ("edit", edit)):
             if isinstance(frames, str):
                 raise TypeError(f"{name} must be several names, not {frames!r}")
-        if isinstance(port, bool) or not isinstance(port, int):
-            raise TypeError(f"a port must be an int, not {port!r}")
-        if not 0 <= port <= 65_535:
-            raise ValueError(f"a port must be from 0 to 65535, got {port}")
         if not is_real(rate):
             raise TypeError(f"a rate must be a number in Hz, not {rate!r}")
         if not 0.0 < rate < float("inf"):
@@ -188,8 +183,6 @@ class View(AsyncOnly):
         trails, edit = tuple(trails), tuple(edit)
         for frame in (*trails, *edit, *(() if fixed is None else (fixed,))):
             check_frame(frame)
-        self.bus = bus
-        self.address: str = ""
         self._buffer = buffer
         self._urdf = urdf
         self._package_paths = tuple(Path(path) for path in package_paths)
@@ -202,11 +195,9 @@ class View(AsyncOnly):
         self._viewers: set[_Viewer] = set()
         self._viewers_changed = anyio.Event()
         self._refused = 0
-        self._entered = False
         self._files: dict[str, WebFile] = {}
-        site = WebSite(self._files, self._serve, MAX_MESSAGE)
-        self._server = WebServer(host, port, WebDoor(host, origins), site.answer, search=True)
-        self._tasks: anyio.abc.TaskGroup
+        self._tasks: anyio.abc.TaskGroup | None = None
+        super().__init__(bus, host, port, origins, WebSite(self._files, self._serve, MAX_MESSAGE).answer, search=True)
 
     def add_points(
         self,
@@ -272,38 +263,22 @@ class View(AsyncOnly):
     @property
     def refused(self) -> int:
         """Refused: requests of other pages, orders that cannot be carried out, connections beyond 100 at once."""
-        return self._server.refused + self._refused
+        return super().refused + self._refused
 
     def statistics(self) -> QueueStatistics:
         """The counters of people's orders; a browser with too many has to wait, so none is dropped."""
         pending = sum(len(viewer.orders) for viewer in self._viewers)
         return QueueStatistics("orders", "wait", _ORDERS * max(1, self.viewers), pending, 0)
 
-    async def __aenter__(self) -> Self:
-        if self._entered:
-            raise RuntimeError("a view is entered once: make another one")
-        self.bus._check_thread()
-        if self.bus.closed:
-            raise BusClosedError
-        self._entered = True
+    async def _open(self) -> None:
         await anyio.to_thread.run_sync(self._read_files)
-        await self._server.__aenter__()
         self._tasks = await anyio.create_task_group().__aenter__()
-        self.bus._entered.add(self)
-        self.address = f"http://{self._server.place}"
         self._tasks.start_soon(self._listen)
-        return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.address = ""
-        self.bus._entered.discard(self)
-        self._tasks.cancel_scope.cancel()
-        try:
+    async def _close(self) -> None:
+        if self._tasks is not None:
+            self._tasks.cancel_scope.cancel()
             await close_task_group(self._tasks)
-        finally:
-            await self._server.__aexit__(None, None, None)
 
     def _read_files(self) -> None:
         for path in sorted(_FILES.rglob("*")):

@@ -5,7 +5,7 @@ from typing import Final, Self
 
 from tfbus.links.zenoh.sessions import Addresses, Settings
 from tfbus.links.zenoh.wire import ZenohWire
-from tfbus.registration import AsyncOnly, warn_unless_entered
+from tfbus.registration import AsyncOnly
 
 ROUTER: Final = "tcp/127.0.0.1:17447"
 """The address of a router that is given none: only processes of this machine reach it."""
@@ -52,14 +52,10 @@ class ZenohRouter(AsyncOnly):
     ) -> None:
         # A link of no bus, which hears nobody.
         self._wire = ZenohWire("@router", listen=listen, connect=connect, config=config, lease=lease)
-        self._entered = False
-        self._never_entered = warn_unless_entered(self)
+        self._warn_unless_entered()
 
     async def __aenter__(self) -> Self:
-        if self._entered:
-            raise RuntimeError("a router is entered once: make another one")
-        self._entered = True
-        self._never_entered.detach()
+        self._enter_once()
         try:
             await self._wire.open((), lambda *_: None, lambda _: None)
         except BaseException:
