@@ -125,7 +125,7 @@ async def test_a_page_outlives_its_bus(shown: Shown) -> None:
 
 
 @pytest.mark.every_loop
-async def test_what_happens_is_drawn_while_somebody_looks_and_nothing_listens_after_that(
+async def test_what_happens_is_drawn_while_somebody_looks_and_nothing_listens_or_runs_after_that(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     shown = Shown(static("map", "dock"))
@@ -150,6 +150,8 @@ async def test_what_happens_is_drawn_while_somebody_looks_and_nothing_listens_af
         await page.until(lambda: page.x == {"map": 0.0, "dock": 0.0, "other": 0.0})
         await page.socket.close()
         await until(lambda: not view.viewers and not shown.bus.statistics().queues)
+        with anyio.fail_after(30.0):
+            await anyio.wait_all_tasks_blocked()
 
 
 async def test_each_browser_has_a_selection_a_time_and_a_fixed_frame_of_its_own() -> None:

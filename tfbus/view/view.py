@@ -383,17 +383,17 @@ class View(BusServer):
     async def _listen(self) -> None:
         """Listen to the bus while somebody looks."""
         while True:
+            await self._until_looked_at(True)
+            async with anyio.create_task_group() as tasks:
+                with self._listening():
+                    tasks.start_soon(self._note_events)
+                    await self._until_looked_at(False)
+                tasks.cancel_scope.cancel()
+
+    async def _until_looked_at(self, wanted: bool) -> None:
+        while bool(self._viewers) is not wanted:
             self._viewers_changed = anyio.Event()
-            if self._viewers:
-                async with anyio.create_task_group() as tasks:
-                    with self._listening():
-                        tasks.start_soon(self._note_events)
-                        while self._viewers:
-                            self._viewers_changed = anyio.Event()
-                            await self._viewers_changed.wait()
-                    tasks.cancel_scope.cancel()
-            else:
-                await self._viewers_changed.wait()
+            await self._viewers_changed.wait()
 
     @contextmanager
     def _listening(self) -> Iterator[None]:
