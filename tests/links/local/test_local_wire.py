@@ -227,15 +227,15 @@ async def test_a_link_that_floods_leaves_other_tasks_their_turns(directory: str)
             peer = await RawPeer.connect(files_in(directory)[0])
             async with peer.stream:
                 await peer.meet()
-                tasks.start_soon(peer.say, *[b"1"] * 300)
+                tasks.start_soon(peer.say, *[bytes(10_000)] * 300)
                 while total < 300:
                     await anyio.lowlevel.checkpoint()
                     since_turn = 0
             tasks.cancel_scope.cancel()
     finally:
         await wire.close()
-    # A turn has 1 ms, and trio may let a task be the last of one round and the first of the next.
-    assert most <= 12
+    # A turn has 1 ms and one read, and trio may let a task be the last of one round and the first of the next.
+    assert most <= 20
 
 
 # Strangers

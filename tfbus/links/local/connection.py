@@ -6,7 +6,7 @@ import selectors
 import socket
 import struct
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from selectors import EVENT_READ, EVENT_WRITE
 from time import monotonic
 from typing import Any, Final
@@ -25,6 +25,8 @@ MOST_SENT: Final = 2**24
 LONGEST_HELLO: Final = 2**14
 MOST_AT_ONCE: Final = 2**18
 """Bytes that are written to one socket before others have their turn."""
+READ_AT_ONCE: Final = 2**15
+"""Bytes that are read from one socket before others have their turn."""
 KEY: Final = 32
 """Bytes of a key; the side that connects says the first half, and the other side the second half."""
 LENGTH: Final = struct.Struct("<I")
@@ -52,15 +54,6 @@ class Poll:
 
     def __init__(self) -> None:
         self._selector = selectors.DefaultSelector()
-        fileno = getattr(self._selector, "fileno", None)
-        self._file: int | None = None if fileno is None else fileno()
-        # An asyncio loop watches the file all the time: to begin and end that for each message costs a third more.
-        loop = anyio.lowlevel.current_token().native_token
-        self._loop: Any = loop if self._file is not None and hasattr(loop, "add_reader") else None
-        self._ready: Any = None
-        self._threads = anyio.CapacityLimiter(1)
-        if self._loop is not None:
-            self._loop.add_reader(self._file, self._wake)
 
     def watch(self, sock: socket.socket, owner: object, events: int) -> None:
         """Wait on a socket for bytes, for room, for both, or no more; the last before it is closed."""
@@ -78,32 +71,28 @@ class Poll:
         found = self._selector.select(patience) if self._selector.get_map() else []
         return [(key.data, bool(events & EVENT_READ), bool(events & EVENT_WRITE)) for key, events in found]
 
-    async def wait(self) -> list[tuple[Any, bool, bool]]:
-        """Wait until a socket may be ready; returns as `ready`."""
-        if self._loop is not None:
-            self._ready = self._loop.create_future()
-            found: list[tuple[Any, bool, bool]] = await self._ready
-            return found
-        if self._file is None:
-            return await anyio.to_thread.run_sync(
-                self.ready, _LOOK_AGAIN, abandon_on_cancel=True, limiter=self._threads
-            )
-        await anyio.wait_readable(self._file)
-        return self.ready()
-
-    def _wake(self) -> None:
-        # The loop may have seen the file before the task has read all.
-        if self._ready is not None and not self._ready.done() and (found := self.ready()):
-            self._ready.set_result(found)
+    async def run(self, serve: Callable[[], object]) -> None:
+        """Call `serve` when any socket is ready, until cancelled; again in the next turn if it leaves any."""
+        if not hasattr(self._selector, "fileno"):
+            thread = anyio.CapacityLimiter(1)
+            while True:
+                await anyio.to_thread.run_sync(self.ready, _LOOK_AGAIN, abandon_on_cancel=True, limiter=thread)
+                serve()
+        file: int = self._selector.fileno()
+        loop: Any = anyio.lowlevel.current_token().native_token
+        if hasattr(loop, "add_reader"):
+            # To begin and end that for each message costs a third more.
+            loop.add_reader(file, serve)
+            try:
+                await anyio.sleep_forever()
+            finally:
+                loop.remove_reader(file)
+        while True:
+            await anyio.wait_readable(file)
+            serve()
 
     def close(self) -> None:
-        """Stop waiting, and close the file."""
-        if self._loop is not None:
-            self._loop.remove_reader(self._file)
-        self.abandon()
-
-    def abandon(self) -> None:
-        """Close the file in a child process; the parent goes on waiting with its own."""
+        """Close the file; in a child process, the parent goes on waiting with its own."""
         self._selector.close()
 
 
@@ -155,109 +144,100 @@ class Connection:
         self.closed: bool = False
         self.tail: bytearray = bytearray()
         self.waits: bool = waits
-        self._reads = True
-        # The rest of a frame whose writing has begun: nothing goes before it.
-        self._rest: memoryview | None = None
+        # The rest of the frame that is written next: nothing goes before it.
+        self._begun = memoryview(b"")
         self._sent: deque[bytes] = deque()
         self._published: deque[bytes] = deque()
         self._size_sent = self._size_published = 0
         self._watch()
 
     def _watch(self) -> None:
-        self._poll.watch(self.sock, self, EVENT_READ * self._reads | EVENT_WRITE * self.waits)
+        self._poll.watch(self.sock, self, EVENT_READ | EVENT_WRITE * self.waits)
 
     # Writing
 
     def publish(self, frame: bytes) -> None:
         """Write a frame at once, or have it wait; the oldest that wait are dropped."""
-        if self.waits or not self._write_at_once(frame):
-            self._published.append(frame)
-            self._size_published += len(frame)
-            while self._size_published > MOST_PUBLISHED:
-                self._size_published -= len(self._published.popleft())
+        self._published.append(frame)
+        self._size_published += len(frame)
+        if not self.waits:
+            self.flush()
+        while self._size_published > MOST_PUBLISHED:
+            self._size_published -= len(self._published.popleft())
 
     def send(self, frame: bytes) -> bool:
         """Write a frame at once, or have it wait before all that are published; False if there is no room."""
-        if self.waits or not self._write_at_once(frame):
-            if self._size_sent + len(frame) > MOST_SENT:
-                return False
-            self._sent.append(frame)
-            self._size_sent += len(frame)
+        if self._size_sent + len(frame) > MOST_SENT:
+            return False
+        self._sent.append(frame)
+        self._size_sent += len(frame)
+        if not self.waits:
+            self.flush()
         return True
-
-    def _write(self, data: bytes | memoryview) -> int:
-        try:
-            return self.sock.send(data, _FLAGS)
-        except BlockingIOError:
-            return 0
-        except OSError:
-            # The other side reads no more. The reading finds the end, after all that the other has written before.
-            return len(data)
-
-    def _write_at_once(self, frame: bytes) -> bool:
-        """Whether a part of the frame is written; then the rest goes before all others."""
-        written = self._write(frame)
-        if written < len(frame):
-            self._rest = memoryview(frame)[written:] if written else None
-            self.waits = True
-            self._watch()
-        return written > 0
 
     def flush(self) -> None:
         """Write the waiting frames, as far as there is room."""
-        most = MOST_AT_ONCE
-        while most > 0:
-            queue = self._sent or self._published
-            if self._rest is None and not queue:
-                self.waits = False
-                self._watch()
-                return
-            frame = memoryview(queue[0]) if self._rest is None else self._rest
-            written = self._write(frame)
-            if not written:
-                return
-            if self._rest is None:
-                self._size_sent -= len(frame) * (queue is self._sent)
-                self._size_published -= len(frame) * (queue is self._published)
-                queue.popleft()
-            self._rest = frame[written:] if written < len(frame) else None
+        written, most = 1, MOST_AT_ONCE
+        while written and most > 0 and self._next_frame():
+            try:
+                written = self.sock.send(self._begun, _FLAGS)
+            except BlockingIOError:
+                written = 0
+            except OSError:
+                # The other side reads no more. The reading finds the end, after all that the other has written before.
+                written = len(self._begun)
+            self._begun = self._begun[written:]
             most -= written
+        waits = bool(self._begun or self._sent or self._published)
+        if waits is not self.waits:
+            self.waits = waits
+            self._watch()
 
-    def stop_reading(self) -> None:
-        """Wait for room only, while anything waits."""
-        self._reads = False
-        self._watch()
+    def _next_frame(self) -> bool:
+        """Have the next frame begun, if none is; returns whether there is one."""
+        if not self._begun and self._sent:
+            self._begun = memoryview(self._sent.popleft())
+            self._size_sent -= len(self._begun)
+        elif not self._begun and self._published:
+            self._begun = memoryview(self._published.popleft())
+            self._size_published -= len(self._begun)
+        return bool(self._begun)
+
+    async def drain(self) -> None:
+        """Wait until all that waits has been written, instead of the poll."""
+        while self.waits:
+            await anyio.wait_writable(self.sock)
+            self.flush()
 
     # Reading
 
-    def frames(self, chunk: memoryview) -> Iterator[bytes]:
-        """The messages that are complete with a chunk of bytes; the beginning of another one is kept.
+    def read(self) -> Iterator[bytes]:
+        """The messages that are complete with the bytes that are there; the beginning of another one is kept.
 
         Raises
         ------
+        OSError
+            If the connection has ended.
         MalformedMessageError
             If a message is longer than any; nothing more can be read.
         """
-        data: bytearray | memoryview = chunk
-        if self.tail:
-            self.tail += chunk
-            data = self.tail
-        at, end = 0, len(data)
-        while end - at >= 4:
-            (length,) = LENGTH.unpack_from(data, at)
+        chunk = self.sock.recv(READ_AT_ONCE)
+        if not chunk:
+            raise ConnectionResetError("the other side has ended the connection")
+        self.tail += chunk
+        at = 0
+        while len(self.tail) - at >= LENGTH.size:
+            (length,) = LENGTH.unpack_from(self.tail, at)
             longest = MAX_MESSAGE if self.met else LONGEST_HELLO
             if length > longest:
                 raise MalformedMessageError("oversized", f"a message of {length} bytes, where {longest} are the most")
-            if end - at - 4 < length:
+            start, end = at + LENGTH.size, at + LENGTH.size + length
+            if end > len(self.tail):
                 break
-            start, at = at + 4, at + 4 + length
-            yield bytes(memoryview(data)[start:at])
-        if data is not chunk:
-            del self.tail[:at]
-        elif at < end:
-            self.tail += chunk[at:]
-        if self.tail:
-            self.grown = monotonic()
+            yield bytes(memoryview(self.tail)[start:end])
+            at = end
+        del self.tail[:at]
+        self.grown = monotonic()
 
     # Meeting
 

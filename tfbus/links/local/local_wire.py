@@ -26,10 +26,9 @@ Connecting
 ----------
 The younger link connects to the older ones, when it opens and whenever it looks into the directory; so two
 links never connect to each other, and one that was missed is met at the next look. A link looks often at first, and
-then once a second; it connects to a name every half second at most. A younger link that has not connected within a
-second may have been killed: a connection on which nothing is said finds that out, and then its name is removed. An id
-in use is not taken over: another connection of that id is refused while the first one is there. A newer one replaces
-one that is not met yet.
+then once a second. A younger link that has not connected by then may have been killed: a connection on which nothing is
+said finds that out, and then its name is removed. An id in use is not taken over: another connection of that id is
+refused while the first one is there. A newer one replaces one that is not met yet.
 
 Present and lost
 ----------------
@@ -49,11 +48,12 @@ that are not met, the newest 64 are kept, for 10 s. One turn of the event loop r
 import os
 import secrets
 import socket
+from collections import deque
 from collections.abc import Callable, Sequence
 from random import uniform
 from selectors import EVENT_READ
 from time import monotonic
-from typing import Final
+from typing import Any, Final
 from weakref import WeakSet
 
 import anyio
@@ -72,9 +72,7 @@ MOST_UNFINISHED: Final = 2**26
 """Bytes of all unfinished messages together."""
 PATIENCE: Final = 10.0
 """s until a connection has to be met."""
-READ_BUFFER: Final = 2**17
 _OFTEN, _RARELY = 0.01, 1.0
-_RETRY = 0.5
 _FLUSH_TIME = 1.0
 
 
@@ -111,12 +109,11 @@ class LocalWire(Wire):
         self._connections: dict[Connection, None] = {}
         self._links: dict[str, Connection] = {}
         self._hearers: dict[str, list[Connection]] = {}
-        # The time before which a name is not dialled (s).
-        self._due: dict[str, float] = {}
+        self._budget = TurnBudget()
+        self._ready: deque[tuple[Any, bool, bool]] = deque()
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
         self._hears, self._receive, self._warn = tuple(hears), receive, warn
-        self._buffer = memoryview(bytearray(READ_BUFFER))
         self._poll = Poll()
         _open_wires.add(self)
         self._listen()
@@ -125,7 +122,7 @@ class LocalWire(Wire):
 
     async def run(self) -> None:
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(self._move)
+            tasks.start_soon(self._poll.run, self._serve)
             tasks.start_soon(self._meet)
 
     def is_heard(self, channel: str) -> bool:
@@ -150,25 +147,22 @@ class LocalWire(Wire):
             return
         _open_wires.discard(self)
         self._place.close()
-        self._stop_listening()
         try:
-            for connection in self._connections:
-                connection.stop_reading()
             with anyio.move_on_after(_FLUSH_TIME, shield=True):
-                while any(connection.waits for connection in self._links.values()):
-                    for connection, _, _ in await self._poll.wait():
-                        connection.flush()
+                async with anyio.create_task_group() as tasks:
+                    for connection in self._links.values():
+                        tasks.start_soon(connection.drain)
         finally:
             self._close_sockets()
             self._poll.close()
 
     def _close_sockets(self) -> None:
+        self._stop_listening()
         for connection in self._connections:
             connection.close()
         self._connections.clear()
         self._links.clear()
         self._hearers.clear()
-        self._buffer = memoryview(b"")
 
     # Listening and dialling
 
@@ -197,10 +191,11 @@ class LocalWire(Wire):
             begun = monotonic() - PATIENCE
             for connection in [each for each in self._connections if not each.met and each.begun < begun]:
                 self._end(connection)
-            self._look()
+            # A younger link connects by itself, unless it was killed.
+            self._look(younger=pause == _RARELY)
 
-    def _look(self) -> None:
-        """Connect to the links that are not met and due, and show this link's name again if it has vanished."""
+    def _look(self, younger: bool = False) -> None:
+        """Connect to the older links that are not met, or to all, and show this link's name if it has vanished."""
         try:
             try:
                 names = self._place.others()
@@ -210,13 +205,11 @@ class LocalWire(Wire):
         except OSError as error:
             self._warn(error)
             return
-        now, own = monotonic(), self._place.name
-        # The younger link connects by itself, unless it was killed.
-        self._due = {name: self._due.get(name, now + _RARELY * (name > own)) for name in names}
         dialled = {connection.dialled for connection in self._connections}
         met = {link[:8] for link in self._links}
-        for name, due in self._due.items():
-            if due <= now and name not in dialled and name[-8:] not in met and not self._is_full():
+        for name in names:
+            is_wanted = (younger or name < self._place.name) and name not in dialled and name[-8:] not in met
+            if is_wanted and not self._is_full():
                 self._dial(name)
 
     def _is_full(self) -> bool:
@@ -226,7 +219,6 @@ class LocalWire(Wire):
         return full
 
     def _dial(self, name: str) -> None:
-        self._due[name] = monotonic() + _RETRY * uniform(0.8, 1.2)
         try:
             sock, key = self._place.dial(name)
         except (ConnectionRefusedError, FileNotFoundError, BlockingIOError):
@@ -240,64 +232,57 @@ class LocalWire(Wire):
         if name < self._place.name:
             connection.say_hello(self.id, self._robot)
 
-    async def _accept(self, budget: TurnBudget) -> None:
-        while self._listener is not None:
-            try:
-                sock, _ = self._listener.accept()
-            except (BlockingIOError, ConnectionAbortedError):
-                return
-            except OSError as error:
-                # There are too many open files. Existing connections go on, and the next look tries again.
-                self._warn(error)
-                self._poll.watch(self._listener, None, 0)
-                return
-            try:
-                self._place.prepare(sock)
-            except OSError as error:
-                sock.close()
-                self._warn(error)
-                continue
-            strangers = [each for each in self._connections if not each.met and not each.dialled]
-            if len(strangers) >= MOST_STRANGERS:
-                self._end(strangers[0])
-            if self._is_full():
-                sock.close()
-                continue
-            connection = Connection(sock, self._poll, self._place.key)
-            self._connections[connection] = None
-            # Mostly the hello is there already, so links that connect all at once do not push each other out.
-            await self._read(connection, budget)
-            await budget.give_way()
+    def _accept(self) -> None:
+        assert self._listener is not None
+        try:
+            sock, _ = self._listener.accept()
+        except (BlockingIOError, ConnectionAbortedError):
+            return
+        except OSError as error:
+            # There are too many open files. Existing connections go on, and the next look tries again.
+            self._warn(error)
+            self._poll.watch(self._listener, None, 0)
+            return
+        try:
+            self._place.prepare(sock)
+        except OSError as error:
+            sock.close()
+            self._warn(error)
+            return
+        strangers = [each for each in self._connections if not each.met and not each.dialled]
+        if len(strangers) >= MOST_STRANGERS:
+            self._end(strangers[0])
+        if self._is_full():
+            sock.close()
+            return
+        connection = Connection(sock, self._poll, self._place.key)
+        self._connections[connection] = None
+        # Mostly the hello is there already, so links that connect all at once do not push each other out.
+        self._read(connection)
 
     # Moving bytes
 
-    async def _move(self) -> None:
-        """Read all connections, and write the frames that wait for room."""
-        budget = TurnBudget()
-        while True:
-            ready = await self._poll.wait()
-            budget.begin()
-            for connection, readable, writable in ready:
-                if connection is None:
-                    await self._accept(budget)
-                else:
-                    # The reading first: it tells the error of a socket, and ends its connection.
-                    if readable and not connection.closed:
-                        await self._read(connection, budget)
-                    if writable and not connection.closed:
-                        connection.flush()
-                await budget.give_way()
+    def _serve(self) -> None:
+        """Read connections, and write the frames that wait for room, for one turn of the event loop."""
+        self._budget.begin()
+        # The connections that a turn leaves come first in the next one.
+        self._ready = self._ready or deque(self._poll.ready())
+        while self._ready and not self._budget.spent:
+            connection, readable, writable = self._ready.popleft()
+            if connection is None:
+                self._accept()
+                continue
+            # The reading first: it tells the error of a socket, and ends its connection.
+            if readable and not connection.closed:
+                self._read(connection)
+            if writable and not connection.closed:
+                connection.flush()
 
-    async def _read(self, connection: Connection, budget: TurnBudget) -> None:
+    def _read(self, connection: Connection) -> None:
         try:
-            size = connection.sock.recv_into(self._buffer)
-            if not size:
-                self._end(connection)
-                return
-            for content in connection.frames(self._buffer[:size]):
+            for content in connection.read():
                 if connection.met:
                     self._receive(connection.link, content)
-                    await budget.give_way()
                 else:
                     self._greet(connection, content)
                 if connection.closed:
@@ -326,8 +311,6 @@ class LocalWire(Wire):
 
     def _end(self, connection: Connection) -> None:
         """Close a connection, and say that its link has left."""
-        if connection.closed:
-            return
         connection.close()
         del self._connections[connection]
         if connection.met:
@@ -363,8 +346,7 @@ class LocalWire(Wire):
     def abandon(self) -> None:
         """Forget everything in a child process, where it belongs to the parent."""
         self._place.name = ""
-        self._poll.abandon()
-        self._stop_listening()
+        self._poll.close()
         self._close_sockets()
 
 
