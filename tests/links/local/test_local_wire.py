@@ -76,7 +76,7 @@ async def test_an_id_in_use_is_not_taken_over(directory: str) -> None:
         assert [item for _, item in ear_one.items].count(Left()) == 0
 
 
-async def test_a_link_that_connects_again_before_it_was_met_is_met_by_the_newer_connection(directory: str) -> None:
+async def test_a_link_that_connects_twice_at_once_is_met_once(directory: str) -> None:
     wire = LocalWire(DOMAIN, directory=directory)
     async with running(wire) as ear:
         first, second = [await RawPeer.connect(files_in(directory)[0]) for _ in range(2)]
@@ -85,7 +85,10 @@ async def test_a_link_that_connects_again_before_it_was_met_is_met_by_the_newer_
             assert await first.hear()
             await second.meet(link=first.link)
             await ear.joined(first.link)
+            await first.say(b"all")
             assert len(await first.end()) == 1
+            await second.say(b"still here")
+            await until(lambda: ear.said(first.link) == [b"still here"])
 
 
 # Frames

@@ -32,10 +32,8 @@ KEY: Final = 32
 LENGTH: Final = struct.Struct("<I")
 _LOOK_AGAIN: Final = 0.02
 _PROTOCOL = b"tfbus local 2\n"
-_HELLO = struct.Struct(f"{len(_PROTOCOL)}s32s{KEY // 2}s")
-_LINK = re.compile("[0-9a-f]{32}")
-_CHANNEL = re.compile("[A-Za-z0-9_-]{0,32}")
-_ROBOT = re.compile(r"[\w.-]{0,200}", re.ASCII)
+_HELLO = re.compile(_PROTOCOL + rb"(?P<link>[0-9a-f]{32})(?P<key>.{16})(?P<robot>[\w.-]{0,200})", re.DOTALL)
+_CHANNEL = re.compile(rb"[A-Za-z0-9_-]{0,32}")
 _FLAGS = getattr(socket, "MSG_NOSIGNAL", 0)
 
 
@@ -66,10 +64,9 @@ class Poll:
             if events:
                 self._selector.register(sock, events, owner)
 
-    def ready(self, patience: float = 0.0) -> list[tuple[Any, bool, bool]]:
-        """The owners of the sockets that are ready, with whether there are bytes to read, and room to write."""
-        found = self._selector.select(patience) if self._selector.get_map() else []
-        return [(key.data, bool(events & EVENT_READ), bool(events & EVENT_WRITE)) for key, events in found]
+    def ready(self, patience: float = 0.0) -> list[tuple[selectors.SelectorKey, int]]:
+        """The sockets that are ready, with whether there are bytes to read, and room to write."""
+        return self._selector.select(patience) if self._selector.get_map() else []
 
     async def run(self, serve: Callable[[], object]) -> None:
         """Call `serve` when any socket is ready, until cancelled; again in the next turn if it leaves any."""
@@ -243,21 +240,16 @@ class Connection:
 
     def say_hello(self, link: str, robot: str) -> None:
         """Send the first message of a link, which names it, and shows that it knows the key."""
-        self.send(frame_of(_HELLO.pack(_PROTOCOL, link.encode(), self._said) + robot.encode()))
+        self.send(frame_of(_PROTOCOL + link.encode() + self._said + robot.encode()))
 
     def take_hello(self, content: bytes) -> None:
         """Take the other's first message; raises `ValueError` if it is none, or does not know the key."""
-        if len(content) < _HELLO.size:
-            raise ValueError("a hello is too short")
-        protocol, link, said = _HELLO.unpack_from(content)
-        robot = content[_HELLO.size :].decode()
-        if protocol != _PROTOCOL:
-            raise ValueError(f"a link speaks {protocol!r}, and this one {_PROTOCOL!r}")
-        if not hmac.compare_digest(said, self._awaited):
+        hello = _HELLO.fullmatch(content)
+        if hello is None:
+            raise ValueError(f"a link says {content[:100]!r}, and {_PROTOCOL!r}, an id, a key and a robot are a hello")
+        if not hmac.compare_digest(hello["key"], self._awaited):
             raise ValueError("a link does not know the key")
-        if not _LINK.fullmatch(link.decode("ascii")) or not _ROBOT.fullmatch(robot):
-            raise ValueError("a hello has no id, or no name of a robot")
-        self.link, self.robot = link.decode("ascii"), robot
+        self.link, self.robot = hello["link"].decode(), hello["robot"].decode()
 
     def say_welcome(self, heard: str | None) -> None:
         """Send the second message: the channel that this link hears of the other."""
@@ -266,10 +258,9 @@ class Connection:
 
     def take_welcome(self, content: bytes) -> None:
         """Take the other's second message; raises `ValueError` if it names no channel."""
-        channel = content.decode("ascii")
-        if not _CHANNEL.fullmatch(channel):
+        if not _CHANNEL.fullmatch(content):
             raise ValueError("a welcome names no channel")
-        self.hears = channel or None
+        self.hears = content.decode() or None
         self.met = True
 
     def close(self) -> None:

@@ -28,7 +28,7 @@ The younger link connects to the older ones, when it opens and whenever it looks
 links never connect to each other, and one that was missed is met at the next look. A link looks often at first, and
 then once a second. A younger link that has not connected by then may have been killed: a connection on which nothing is
 said finds that out, and then its name is removed. An id in use is not taken over: another connection of that id is
-refused while the first one is there. A newer one replaces one that is not met yet.
+refused while the first one is there.
 
 Present and lost
 ----------------
@@ -42,7 +42,8 @@ Each connection queues at most 8 MiB of published messages, and then drops the o
 messages, which go first; a frame whose writing has begun is finished before. A message is at most `MAX_MESSAGE` long; a
 longer one ends its connection. All unfinished messages have at most 64 MiB together; beyond that, the connection whose
 message has not grown for the longest time is closed. There are at most 1,000 connections. Of the incoming connections
-that are not met, the newest 64 are kept, for 10 s. One turn of the event loop reads for about a millisecond.
+that are not met, the newest 64 are kept, for 10 s. One turn of the event loop reads for about a millisecond,
+and one read more.
 """
 
 import os
@@ -51,9 +52,9 @@ import socket
 from collections import deque
 from collections.abc import Callable, Sequence
 from random import uniform
-from selectors import EVENT_READ
+from selectors import EVENT_READ, EVENT_WRITE, SelectorKey
 from time import monotonic
-from typing import Any, Final
+from typing import Final
 from weakref import WeakSet
 
 import anyio
@@ -105,12 +106,11 @@ class LocalWire(Wire):
             domain, self.id, directory, not hasattr(socket, "AF_UNIX") if loopback is None else loopback
         )
         self._listener: socket.socket | None = None
-        # All of them, the oldest first; and those that are met, by the ids of the other links and by their channels.
+        # All of them, the oldest first; and those that are met, by the ids of the other links.
         self._connections: dict[Connection, None] = {}
         self._links: dict[str, Connection] = {}
-        self._hearers: dict[str, list[Connection]] = {}
         self._budget = TurnBudget()
-        self._ready: deque[tuple[Any, bool, bool]] = deque()
+        self._ready: deque[tuple[SelectorKey, int]] = deque()
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
         self._hears, self._receive, self._warn = tuple(hears), receive, warn
@@ -126,17 +126,17 @@ class LocalWire(Wire):
             tasks.start_soon(self._meet)
 
     def is_heard(self, channel: str) -> bool:
-        return bool(self._hearers.get(channel))
+        return any(connection.hears == channel for connection in self._links.values())
 
     def is_behind(self) -> bool:
-        return any(readable for _, readable, _ in self._poll.ready())
+        return any(events & EVENT_READ for _, events in self._poll.ready())
 
     def publish(self, channel: str, message: bytes) -> None:
-        hearers = self._hearers.get(channel)
-        if hearers and len(message) <= MAX_MESSAGE:
+        if len(message) <= MAX_MESSAGE:
             frame = frame_of(message)
-            for connection in hearers:
-                connection.publish(frame)
+            for connection in self._links.values():
+                if connection.hears == channel:
+                    connection.publish(frame)
 
     def send(self, link: str, message: bytes) -> bool:
         connection = self._links.get(link)
@@ -162,7 +162,6 @@ class LocalWire(Wire):
             connection.close()
         self._connections.clear()
         self._links.clear()
-        self._hearers.clear()
 
     # Listening and dialling
 
@@ -177,7 +176,6 @@ class LocalWire(Wire):
         if self._listener is not None:
             self._poll.watch(self._listener, None, 0)
             self._listener.close()
-            self._listener = None
 
     async def _meet(self) -> None:
         """Look for older links, and end connections that are not met in time."""
@@ -197,19 +195,17 @@ class LocalWire(Wire):
     def _look(self, younger: bool = False) -> None:
         """Connect to the older links that are not met, or to all, and show this link's name if it has vanished."""
         try:
-            try:
-                names = self._place.others()
-            except FileNotFoundError:
+            names = self._place.names()
+            if self._place.name not in names:
                 self._listen()
-                return
         except OSError as error:
             self._warn(error)
             return
         dialled = {connection.dialled for connection in self._connections}
         met = {link[:8] for link in self._links}
         for name in names:
-            is_wanted = (younger or name < self._place.name) and name not in dialled and name[-8:] not in met
-            if is_wanted and not self._is_full():
+            is_wanted = name < self._place.name or (younger and name != self._place.name)
+            if is_wanted and name not in dialled and name[-8:] not in met and not self._is_full():
                 self._dial(name)
 
     def _is_full(self) -> bool:
@@ -268,14 +264,15 @@ class LocalWire(Wire):
         # The connections that a turn leaves come first in the next one.
         self._ready = self._ready or deque(self._poll.ready())
         while self._ready and not self._budget.spent:
-            connection, readable, writable = self._ready.popleft()
+            key, events = self._ready.popleft()
+            connection = key.data
             if connection is None:
                 self._accept()
                 continue
             # The reading first: it tells the error of a socket, and ends its connection.
-            if readable and not connection.closed:
+            if events & EVENT_READ and not connection.closed:
                 self._read(connection)
-            if writable and not connection.closed:
+            if events & EVENT_WRITE and not connection.closed:
                 connection.flush()
 
     def _read(self, connection: Connection) -> None:
@@ -313,35 +310,27 @@ class LocalWire(Wire):
         """Close a connection, and say that its link has left."""
         connection.close()
         del self._connections[connection]
-        if connection.met:
+        if self._links.get(connection.link) is connection:
             del self._links[connection.link]
-            if connection.hears is not None:
-                self._hearers[connection.hears].remove(connection)
             if connection.heard is not None:
                 self._receive(connection.link, Left())
 
     def _greet(self, connection: Connection, content: bytes) -> None:
         """Take a hello or a welcome; raises `ValueError` if it is none."""
-        if not connection.link:
+        if connection.link:
+            connection.take_welcome(content)
+        else:
             connection.take_hello(content)
-            link = connection.link
-            if link == self.id or link in self._links:
-                self._end(connection)
-                return
-            for earlier in [each for each in self._connections if each.link == link and each is not connection]:
-                self._end(earlier)
+        if connection.link == self.id or connection.link in self._links:
+            self._end(connection)
+        elif connection.met:
+            self._links[connection.link] = connection
+            if connection.heard is not None:
+                self._receive(connection.link, Joined(connection.robot))
+        else:
             if not connection.dialled:
                 connection.say_hello(self.id, self._robot)
             connection.say_welcome(next((one.channel for one in self._hears if one.matches(connection.robot)), None))
-        elif connection.link in self._links:
-            self._end(connection)
-        else:
-            connection.take_welcome(content)
-            self._links[connection.link] = connection
-            if connection.hears is not None:
-                self._hearers.setdefault(connection.hears, []).append(connection)
-            if connection.heard is not None:
-                self._receive(connection.link, Joined(connection.robot))
 
     def abandon(self) -> None:
         """Forget everything in a child process, where it belongs to the parent."""

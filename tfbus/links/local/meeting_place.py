@@ -11,7 +11,6 @@ else ``tfbus-UID`` in the directory for temporary files. It belongs to the user 
 checked before anything is trusted.
 """
 
-import errno
 import os
 import re
 import secrets
@@ -148,19 +147,12 @@ class MeetingPlace:
         sock.setblocking(False)
         return sock
 
-    def others(self) -> list[str]:
-        """The names of the other links.
-
-        Raises
-        ------
-        FileNotFoundError
-            If the link's own name has vanished.
-        """
-        names = [path.name for path in self._directory.iterdir()]
-        if self.name not in names:
-            raise FileNotFoundError(errno.ENOENT, "the link's name has vanished", str(self._directory / self.name))
+    def names(self) -> list[str]:
+        """The names of all links, and of this one unless somebody has removed it; raises `OSError`."""
         of_link = re.compile(f"{self._domain}-[0-9a-f]{{24}}").fullmatch
-        return [name for name in names if name != self.name and of_link(name)]
+        with suppress(FileNotFoundError):
+            return [path.name for path in self._directory.iterdir() if of_link(path.name)]
+        return []
 
     def dial(self, name: str) -> tuple[socket.socket, bytes]:
         """Connect to a link without waiting; returns the socket and the key.
