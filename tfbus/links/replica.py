@@ -64,9 +64,8 @@ each with the buses on the route, so that no link takes a route that leads back 
 BGP, RFC 4271).
 """
 
-import heapq
 import os
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -356,9 +355,8 @@ class Replica:
         # How many frames each other origin has.
         self._held: Counter[bytes] = Counter()
         self._taken = 0
-        # A heap of the removals, the lowest ranks first; a removal stays in it for a while after a newer entry.
+        # The removals in the order of their ranks.
         self._removals: list[tuple[Rank, str]] = []
-        self._removed = 0
         # Frames whose entries have changed since the last claim and are to settle first.
         self._fresh: dict[str, None] = {}
         self._unsettled: dict[str, float] = {}
@@ -398,7 +396,8 @@ class Replica:
         known = self.entries.get(frame)
         is_new = known is None or source.sequence > known.source.sequence or self._replaces(source, sample, known)
         if is_new:
-            if known is None or known.source.origin != source.origin or (known.sample is None) is not (sample is None):
+            is_same = known is not None and known.source.origin == source.origin and known.sample is not None
+            if not is_same or sample is None:
                 self._admit(source.origin, known, sample, max_frames)
             if known is None:
                 known = self.entries[frame] = Known(frame, source, sample)
@@ -417,13 +416,13 @@ class Replica:
         self._fresh.pop(frame, None)
         self._unsettled.pop(frame, None)
         self._number(known, settled=True)
+        if sample is None or sample.static:
+            known.floor = source.rank
         if sample is None:
-            known.floor = source.rank
-            heapq.heappush(self._removals, (source.rank, frame))
-            if self._removed > MOST_REMOVALS or len(self._removals) > 2 * MOST_REMOVALS:
-                self._forget_removals()
-        elif sample.static:
-            known.floor = source.rank
+            insort(self._removals, (source.rank, frame))
+            if len(self._removals) > MOST_REMOVALS:
+                # Those of the lowest ranks, so that all copies forget the same ones.
+                self.discard(self.entries[self._removals[0][1]])
         return True
 
     def widen(self, known: Known, views: "Iterable[View]") -> None:
@@ -493,15 +492,15 @@ class Replica:
                 raise TooManyEntriesError(f"the peer has announced more than {max_frames} frames")
             self._held[origin] += 1
             self._taken += 1
-        self._removed += sample is None
         if known is not None:
             self._release(known)
 
     def _release(self, known: Known) -> None:
         """Count an entry no more."""
         origin = known.source.origin
-        self._removed -= known.sample is None
-        if known.sample is not None and origin != self.origin:
+        if known.sample is None:
+            del self._removals[bisect_left(self._removals, (known.source.rank, known.frame))]
+        elif origin != self.origin:
             self._held[origin] -= 1
             self._taken -= 1
             if not self._held[origin]:
@@ -522,20 +521,6 @@ class Replica:
         change, known.digest = known.digest ^ digest, digest
         for view in known.views:
             view.digest ^= change
-
-    def _forget_removals(self) -> None:
-        """Forget the removals of the lowest ranks beyond the bound, so that all copies forget the same ones."""
-        while self._removed > MOST_REMOVALS:
-            rank, frame = heapq.heappop(self._removals)
-            if self._is_removed(frame, rank):
-                self.discard(self.entries[frame])
-        if len(self._removals) > 2 * MOST_REMOVALS:
-            self._removals = [(rank, frame) for rank, frame in self._removals if self._is_removed(frame, rank)]
-            heapq.heapify(self._removals)
-
-    def _is_removed(self, frame: str, rank: Rank) -> bool:
-        known = self.entries.get(frame)
-        return known is not None and known.sample is None and known.source.rank == rank
 
 
 class View:
