@@ -77,7 +77,7 @@ nitpick_ignore_regex = [
     # The parts of a link, and the follower of a clock.
     ("py:class", r"tfbus\.links\.(endpoint\.(HearsTime|Endpoint)|seams\.Wire|lookups\.Serving)"),
     ("py:class", r"tfbus\._aio\.turn_budget\.TurnBudget"),
-    ("py:class", r"tfbus\.links\.(link\.DomainOptions|domain\.EndOptions|ros\.\w+\.(RosCarrier|RosOptions))"),
+    ("py:class", r"tfbus\.links\.(domain\.DomainOptions|ros\.\w+\.(RosCarrier|RosOptions))"),
     # Sphinx splits the parameters of such types.
     ("py:class", r"[\w.]+\[\w+"),
 ]

@@ -203,7 +203,7 @@ def test_an_offset_is_told_again_when_it_changes_and_when_it_is_over() -> None:
 def test_a_bus_with_a_simulated_clock_is_told_as_one_and_not_measured() -> None:
     world = World()
     network = Network(world)
-    here, there = world.process(network, clock=SkewedClock(world), corrects=True), world.process(network)
+    here, there = world.process(network, clock=SkewedClock(world), correct_clocks=True), world.process(network)
     go(world, 5.0, 1.0, (there, "cart", SkewedClock(world, 77.0)))
     assert str(clock_of(here, there)).endswith("has a simulated clock")
     assert here.frames["cart"].stamp == there.frames["cart"].stamp
@@ -214,8 +214,8 @@ def test_corrected_samples_of_near_and_far_buses_are_stamped_as_if_there_were_on
     first, second = Network(world), Network(world)
     first.delay = lambda *_: 0.0004
     far, middle = SkewedClock(world, 3600.0, 100e-6), SkewedClock(world, -0.3)
-    here = world.process(first, clock=SkewedClock(world), corrects=True)
-    bridge = world.process(first, second, clock=middle, corrects=True)
+    here = world.process(first, clock=SkewedClock(world), correct_clocks=True)
+    bridge = world.process(first, second, clock=middle, correct_clocks=True)
     there = world.process(second, clock=far)
     second.delay = first.delay
     sends = (bridge, "near", middle), (there, "far", far)
@@ -237,14 +237,14 @@ def test_a_joiner_is_told_the_newest_samples_and_the_past_by_another_bus_and_cor
     network.delay = far.delay = lambda *_: 0.0004
     clock = SkewedClock(world, 7.0)
     there = world.process(far, clock=clock)
-    keeper = world.process(network, far, clock=SkewedClock(world, -0.5), corrects=True)
+    keeper = world.process(network, far, clock=SkewedClock(world, -0.5), correct_clocks=True)
     with Buffer(keeper.bus):
         go(world, 5.0, 0.1, (there, "cart", clock))
         world.kill(there)
         world.run(1.0)
         last = world.now - 1.1
         for history in (None, 3.0):
-            late = world.process(network, clock=SkewedClock(world), corrects=True, history=history)
+            late = world.process(network, clock=SkewedClock(world), correct_clocks=True, history=history)
             world.run(3.0)
             assert late.frames["cart"].stamp == pytest.approx(last * SECOND, abs=2_000_000)
             corrected = [sample for sample in late.seen if abs(sample.stamp / SECOND - last) < 4.0]
@@ -261,7 +261,7 @@ def test_a_clock_that_is_set_is_noticed_at_once_and_nothing_is_interpolated_acro
     network = Network(world)
     network.delay = lambda *_: 0.0004
     clock, other = SkewedClock(world), SkewedClock(world)
-    here = world.process(network, clock=SkewedClock(world), corrects=corrects)
+    here = world.process(network, clock=SkewedClock(world), correct_clocks=corrects)
     there, third = world.process(network, clock=clock), world.process(network, clock=other)
     sends = (there, "cart", clock), (third, "tool", other)
     with Buffer(here.bus) as buffer, here.bus.events() as events:
@@ -291,7 +291,7 @@ def test_explanations_and_errors_name_the_clock_that_differs(corrects: bool) -> 
     network = Network(world)
     network.delay = lambda *_: 0.0004
     clock = SkewedClock(world, 0.31)
-    here = world.process(network, clock=SkewedClock(world), corrects=corrects)
+    here = world.process(network, clock=SkewedClock(world), correct_clocks=corrects)
     there = world.process(network, clock=clock)
     with Buffer(here.bus) as buffer:
         go(world, 5.0, 0.1, (there, "cart", clock))
@@ -323,7 +323,7 @@ def test_a_correction_moves_smoothly_and_stays_in_order() -> None:
     network = Network(world)
     network.delay = lambda *_: world.random.uniform(0.001, 0.002)
     clock = SkewedClock(world, 0.3, 50e-6)
-    here = world.process(network, clock=SkewedClock(world), corrects=True)
+    here = world.process(network, clock=SkewedClock(world), correct_clocks=True)
     there = world.process(network, clock=clock)
     go(world, 10.0, 0.01, (there, "cart", clock))
     here.seen.clear()

@@ -348,7 +348,6 @@ class Process:
     ) -> None:
         self.world = world
         clock: SkewedClock | None = options.pop("clock", None)
-        corrects: bool = options.pop("corrects", False)
         self.bus = Bus(clock or SimulatedClock(int(world.now * SECOND)), max_ahead=None)
         if clock is not None:
             # Machines count from when they were started.
@@ -365,8 +364,6 @@ class Process:
         self.wires = [Wire(network, options.get("robot", "")) for network in networks]
         make: dict[str, Any] = {"drop_lost": drop_lost, "now": lambda: world.now, **options}
         self.domain_ends = [DomainEnd(self.bus, "tf", wire, **make) for wire in self.wires]
-        for end in self.domain_ends:
-            end.clocks.corrects = corrects
         carriers = [ForeignCarrier(place, f"bus {len(world.processes)}.{k}") for k, place in enumerate(worlds)]
         self.foreign_ends = [ForeignEnd(self.bus, "world", carrier, drop_lost=drop_lost) for carrier in carriers]
         self.ends: list[Endpoint] = [*self.domain_ends, *self.foreign_ends]

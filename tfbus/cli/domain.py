@@ -30,7 +30,8 @@ with lazy_imports():
     from tfbus.errors import InvalidTransformError, pip_install
     from tfbus.geometry.stamped import TransformStamped
     from tfbus.links.bus_server import BusServer
-    from tfbus.links.link import DomainLink, DomainOptions, Link
+    from tfbus.links.domain import DomainOptions
+    from tfbus.links.link import DomainLink, Link
     from tfbus.links.local import LocalLink
 
 T = TypeVar("T")

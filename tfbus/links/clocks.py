@@ -306,16 +306,13 @@ class Clocks:
         The id of this link.
     max_offset : float
         An offset up to this is not told of, in s.
-
-    Attributes
-    ----------
     corrects : bool
         Whether stamps are moved to the clock of this bus.
     """
 
-    def __init__(self, own: OwnClock, link: str, max_offset: float) -> None:
+    def __init__(self, own: OwnClock, link: str, max_offset: float, *, corrects: bool = False) -> None:
         self.own = own
-        self.corrects = False
+        self.corrects = corrects
         self._id = bytes.fromhex(link[:16])
         self._max_offset = max_offset
         # Filled by any thread.

@@ -6,13 +6,14 @@ from contextlib import nullcontext
 from itertools import islice
 from math import inf
 from time import monotonic
-from typing import Any, TypedDict
+from typing import Any, TypedDict, Unpack
 
 from tfbus.bus.bus import Bus
+from tfbus.clock import SimulatedClock
 from tfbus.events import ClockOffset, PeerClockStepped
 from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
 from tfbus.links.clocks import Clocks
-from tfbus.links.endpoint import MAX_PEERS, Endpoint
+from tfbus.links.endpoint import MAX_PEERS, Endpoint, HearsTime
 from tfbus.links.history import LONGEST_HISTORY, HistoryAsker, chunk_of_past
 from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import (
@@ -70,8 +71,8 @@ _URGENT = frozenset(Kind) - {Kind.LIVE, Kind.SIGN}
 _FOLLOWS = frozenset({Kind.MEETING, Kind.ANSWER, Kind.PAST})
 
 
-class EndOptions(TypedDict, total=False):
-    """The parameters of `DomainEnd` that are for users; `tfbus.links.DomainLink` explains them."""
+class DomainOptions(TypedDict, total=False):
+    """The parameters that all links of tfbus have in common; `tfbus.links.DomainLink` explains them."""
 
     robot: str | None
     robots: Iterable[str] | Mapping[str, float] | None
@@ -81,6 +82,10 @@ class EndOptions(TypedDict, total=False):
     max_frames: int
     history: float | None
     max_offset: float
+    correct_clocks: bool
+    capacity: int
+    clock: SimulatedClock | HearsTime | None
+    tell_clock: bool
 
 
 class DomainEnd(Endpoint):
@@ -95,7 +100,7 @@ class DomainEnd(Endpoint):
     now : callable
         Returns a monotonic time in s.
     **options
-        See `tfbus.links.DomainLink`, which also lists the errors.
+        See `tfbus.links.DomainLink`, which also lists the errors; some are for the link alone.
 
     Attributes
     ----------
@@ -112,17 +117,11 @@ class DomainEnd(Endpoint):
         bus: Bus,
         name: str,
         wire: Wire,
-        *,
-        robot: str | None = None,
-        robots: Iterable[str] | Mapping[str, float] | None = None,
-        slow_rate: float = 1.0,
-        frames: Iterable[str] | None = None,
-        drop_lost: bool = False,
-        max_frames: int = 10_000,
-        history: float | None = None,
-        max_offset: float = 0.02,
         now: Callable[[], float] = monotonic,
+        **options: Unpack[DomainOptions],
     ) -> None:
+        robot, robots = options.get("robot"), options.get("robots")
+        slow_rate, history = options.get("slow_rate", 1.0), options.get("history")
         if isinstance(robots, str):
             raise TypeError(f"robots must be several names, not {robots!r}")
         if robot is not None:
@@ -135,7 +134,8 @@ class DomainEnd(Endpoint):
             raise ValueError(f"a rate must be greater than zero, got {rates!r} and {slow_rate!r} Hz")
         if history is not None and not 0 < as_duration(history, "history") <= LONGEST_HISTORY:
             raise ValueError(f"history must be a time that passes, {LONGEST_HISTORY:g} s at most, got {history}")
-        super().__init__(bus, name, wire, frames, drop_lost, max_frames)
+        frames, drop_lost = options.get("frames"), options.get("drop_lost", False)
+        super().__init__(bus, name, wire, frames, drop_lost, options.get("max_frames", 10_000))
         self._now = now
         self._wire = wire
         self._robot = robot or ""
@@ -148,8 +148,13 @@ class DomainEnd(Endpoint):
         self._channels = Channels(wire, self._bus, self.frames is not None, slow_rate, self.report)
         self.own: View = self._view_of(self._robot)
         self._agreement = Agreement()
-        self.max_offset: float = as_duration(max_offset, "max_offset") * SECOND
-        self.clocks: Clocks = Clocks(self.relay.clock, self.id, max_offset)
+        max_offset, corrects = as_duration(options.get("max_offset", 0.02), "max_offset"), options.get("correct_clocks")
+        if corrects and not self.relay.clock.runs:
+            raise TypeError(
+                f"to correct the stamps of others, the bus needs a clock that runs by itself, not {bus.clock!r}"
+            )
+        self.max_offset: float = max_offset * SECOND
+        self.clocks: Clocks = Clocks(self.relay.clock, self.id, max_offset, corrects=bool(corrects))
         self._history = HistoryAsker(history or 0.0, wire.send, now)
         self.lookups: RemoteLookups = RemoteLookups(wire.send, name)
         # The last sign of each peer that agrees with this link: the same sign once more need not wake the event loop.

@@ -19,7 +19,7 @@ from tfbus.bus.queues import check_capacity
 from tfbus.clock import SimulatedClock
 from tfbus.errors import BusClosedError
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.domain import DomainEnd, EndOptions, check_name
+from tfbus.links.domain import DomainEnd, DomainOptions, check_name
 from tfbus.links.endpoint import Endpoint, HearsTime
 from tfbus.links.lookups import BufferServer, RemoteLookups
 from tfbus.links.message import RemoteQuestion
@@ -439,15 +439,6 @@ class Link(AsyncOnly):
             self._end.clock_jumped_back()
 
 
-class DomainOptions(EndOptions, total=False):
-    """The parameters that all links of tfbus have in common; `DomainLink` explains them."""
-
-    capacity: int
-    clock: SimulatedClock | HearsTime | None
-    tell_clock: bool
-    correct_clocks: bool
-
-
 class DomainLink(Link):
     """Joins a bus to the other buses of a domain; what all links of tfbus have in common.
 
@@ -534,22 +525,13 @@ class DomainLink(Link):
         bus: Bus,
         domain: str,
         wire: Wire,
-        *,
-        capacity: int = 10_000,
-        clock: SimulatedClock | HearsTime | None = None,
-        tell_clock: bool = False,
-        correct_clocks: bool = False,
-        **options: Unpack[EndOptions],
+        **options: Unpack[DomainOptions],
     ) -> None:
         self.domain: str = check_domain(domain)
         self.robot: str | None = options.get("robot")
         self._domain_end = DomainEnd(bus, domain, wire, **options)
-        if correct_clocks and not self._domain_end.clocks.own.runs:
-            raise TypeError(
-                f"to correct the stamps of others, the bus needs a clock that runs by itself, not {bus.clock!r}"
-            )
-        self._domain_end.clocks.corrects = correct_clocks
-        super().__init__(self._domain_end, capacity=capacity, clock=clock, tell_clock=tell_clock)
+        clock, tell_clock = options.get("clock"), options.get("tell_clock", False)
+        super().__init__(self._domain_end, capacity=options.get("capacity", 10_000), clock=clock, tell_clock=tell_clock)
 
     @property
     def lookups(self) -> RemoteLookups:

@@ -3,7 +3,8 @@
 from typing import Unpack
 
 from tfbus.bus.bus import Bus
-from tfbus.links.link import DomainLink, DomainOptions
+from tfbus.links.domain import DomainOptions
+from tfbus.links.link import DomainLink
 from tfbus.links.local.local_wire import LocalWire
 
 

@@ -3,7 +3,8 @@
 from typing import Unpack
 
 from tfbus.bus.bus import Bus
-from tfbus.links.link import DomainLink, DomainOptions, check_domain
+from tfbus.links.domain import DomainOptions
+from tfbus.links.link import DomainLink, check_domain
 from tfbus.links.zenoh.sessions import Addresses, Settings
 from tfbus.links.zenoh.wire import ZenohWire
 
