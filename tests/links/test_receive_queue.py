@@ -67,7 +67,7 @@ def test_what_is_read_before_the_end_of_a_peer_makes_room_too() -> None:
     for item in (moving(1), moving(2), LEFT, kept("a"), moving(3)):
         queue.put(item)
     assert queue.statistics().dropped == 1
-    assert drained(queue) == [1, 2, Left(), "a"], "what is to be read first is dropped last"
+    assert drained(queue) == [2, Left(), "a", 3], "the oldest moving item makes room"
     for item in (moving(1, MIB), LEFT, kept("a", ROOM - MIB)):
         queue.put(item)
     assert drained(queue) == [Left(), "a"], "moving items make room first"

@@ -2,8 +2,9 @@
 
 import math
 import threading
-from collections import deque
+from collections import OrderedDict
 from collections.abc import Iterator
+from itertools import count
 from time import monotonic
 from types import TracebackType
 from typing import Any, Final, Literal, Self, Unpack, overload
@@ -61,84 +62,62 @@ class ReceiveQueue:
     ----------
     capacity : int
         How many moving items may be pending, within 64 MiB for all items together; beyond that the oldest moving items
-        are dropped, and when there are none, the oldest of the others. The items that are read first are dropped last.
+        are dropped, and when there are none, the oldest of the others, the urgent ones last.
     """
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._lock = threading.Lock()
-        self._urgent: deque[Received] = deque()
-        # Items that do not move and were passed over in a search for the oldest moving one.
-        self._kept: deque[Received] = deque()
-        self._pending: deque[Received] = deque()
+        # The items by their numbers, in the order in which they are read, and the numbers of those that move.
+        self._urgent: OrderedDict[int, Received] = OrderedDict()
+        self._others: OrderedDict[int, Received] = OrderedDict()
+        self._moving: OrderedDict[int, None] = OrderedDict()
+        self._numbers = count()
         self._bytes = 0
-        self._moving = 0
         self._dropped = 0
 
     def __len__(self) -> int:
-        return len(self._urgent) + len(self._kept) + len(self._pending)
+        return len(self._urgent) + len(self._others)
 
     def put(self, item: Received) -> None:
         """Append an item, from any thread."""
         with self._lock:
-            if item.urgent:
-                if isinstance(item.content, Left) or (item.follows and self._moving <= MANY):
-                    self._hurry(item.sender)
-                self._urgent.append(item)
-            else:
-                self._pending.append(item)
+            number = next(self._numbers)
+            if isinstance(item.content, Left) or (item.follows and len(self._moving) <= MANY):
+                # The waiting items of its sender go before it.
+                for earlier in [earlier for earlier, one in self._others.items() if one.sender == item.sender]:
+                    self._urgent[earlier] = self._others.pop(earlier)
+            (self._urgent if item.urgent else self._others)[number] = item
+            if item.moving:
+                self._moving[number] = None
             self._bytes += _footprint(item)
-            self._moving += item.moving
-            while self._moving > self._capacity or self._bytes > _MAX_BYTES:
-                self._drop_oldest()
+            while len(self._moving) > self._capacity or self._bytes > _MAX_BYTES:
+                self._take(next(iter(self._moving or self._others or self._urgent)))
+                self._dropped += 1
 
     def get(self) -> Received | None:
         """Remove and return the oldest item; None if the queue is empty."""
         with self._lock:
-            for queue in (self._urgent, self._kept, self._pending):
-                if queue:
-                    return self._pop(queue)
-        return None
+            queue = self._urgent or self._others
+            return self._take(next(iter(queue))) if queue else None
 
     def discard_moving(self) -> None:
         """Drop all moving items, because the clock has jumped back."""
         with self._lock:
-            for queue in (self._urgent, self._kept, self._pending):
-                kept = [item for item in queue if not item.moving]
-                queue.clear()
-                queue.extend(kept)
-            self._dropped += self._moving
-            self._bytes = sum(map(_footprint, (*self._urgent, *self._kept, *self._pending)))
-            self._moving = 0
+            self._dropped += len(self._moving)
+            for number in list(self._moving):
+                self._take(number)
 
     def statistics(self) -> QueueStatistics:
         """The queue's counters, in items."""
         with self._lock:
             return QueueStatistics("link", "drop_oldest", self._capacity, len(self), self._dropped)
 
-    def _drop_oldest(self) -> None:
-        while self._pending and not self._pending[0].moving:
-            self._kept.append(self._pending.popleft())
-        if self._moving and not self._pending:
-            self._pop(self._urgent, next(place for place, item in enumerate(self._urgent) if item.moving))
-        else:
-            self._pop(self._pending or self._kept or self._urgent)
-        self._dropped += 1
-
-    def _pop(self, queue: deque[Received], place: int = 0) -> Received:
-        item = queue[place]
-        del queue[place]
+    def _take(self, number: int) -> Received:
+        item = (self._urgent if number in self._urgent else self._others).pop(number)
+        self._moving.pop(number, None)
         self._bytes -= _footprint(item)
-        self._moving -= item.moving
         return item
-
-    def _hurry(self, sender: str) -> None:
-        """Move the waiting items of a peer in front of those of other peers."""
-        for queue in (self._kept, self._pending):
-            waiting = list(queue)
-            queue.clear()
-            for item in waiting:
-                (self._urgent if item.sender == sender else queue).append(item)
 
 
 def _footprint(item: Received) -> int:
