@@ -11,7 +11,7 @@ import math
 import os
 import re
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -35,7 +35,8 @@ LONGEST_NAME: Final = 200
 CLOSING_TIME: Final = 1.0
 LONGEST_CLOSE: Final = 15.0
 """s; so long the event loop and the interpreter wait."""
-_NAME = "tfbus and zenoh end"
+THREAD: Final = "tfbus and zenoh end"
+"""The name of each thread for whose end the interpreter waits."""
 _forked = _used = False
 
 Addresses = str | Iterable[str]
@@ -234,7 +235,7 @@ def close_session(session: Closable | None) -> None:
 def begin_to_close(session: Closable | None) -> threading.Thread:
     """Close a session in a thread of its own; returns the thread."""
     # Not a thread that the interpreter waits for without a limit.
-    closing = threading.Thread(target=close_session, args=(session,), name=_NAME, daemon=True)
+    closing = threading.Thread(target=close_session, args=(session,), name=THREAD, daemon=True)
     closing.start()
     return closing
 
@@ -246,51 +247,6 @@ async def wait_until_closed(closing: Sequence[threading.Thread]) -> TimeoutError
     return TimeoutError(f"zenoh has not closed its session within {CLOSING_TIME:g} s, and goes on in the background")
 
 
-class Keeper:
-    """The thread in which a wire opens and closes its sessions, because zenoh's calls block.
-
-    A program that exits without the end of its links has them closed all the same.
-
-    Parameters
-    ----------
-    keep : callable
-        The work of the thread. It returns soon after `stopped`; it calls `wait` meanwhile.
-
-    Attributes
-    ----------
-    changed : threading.Event
-        Set when there is something to do, for instance because of `stop`.
-    stopped : bool
-    """
-
-    def __init__(self, keep: Callable[[], object]) -> None:
-        self.changed: threading.Event = threading.Event()
-        self.stopped: bool = False
-        self._thread = threading.Thread(target=keep, name=_NAME, daemon=True)
-
-    def start(self) -> None:
-        """Begin; raises as `use_zenoh`."""
-        use_zenoh()
-        atexit.register(self.stop)
-        self._thread.start()
-
-    def wait(self, seconds: float) -> None:
-        """Wait for the next change, for so long at most; for the thread."""
-        self.changed.wait(seconds)
-        self.changed.clear()
-
-    def stop(self) -> None:
-        """Have the thread end; from any thread."""
-        self.stopped = True
-        self.changed.set()
-
-    async def end(self) -> TimeoutError | None:
-        """Have the thread end, and wait for it as `wait_until_closed` does; also if it has not begun."""
-        self.stop()
-        atexit.unregister(self.stop)
-        return await wait_until_closed([] if self._thread.ident is None else [self._thread])
-
-
 @atexit.register
 def _wait_at_exit() -> None:
-    join_all([thread for thread in threading.enumerate() if thread.name == _NAME], LONGEST_CLOSE)
+    join_all([thread for thread in threading.enumerate() if thread.name == THREAD], LONGEST_CLOSE)

@@ -30,6 +30,7 @@ Access control by a router's rules: a link publishes by ``put`` and ``delete`` o
 In zenoh ``**`` stands for no part that begins with ``@``. The id of a sender proves nothing.
 """
 
+import atexit
 import math
 import os
 import re
@@ -51,8 +52,8 @@ from tfbus.links.zenoh.neighbours import PAUSE_TO_BEGIN, PAUSE_TO_LISTEN, PERIOD
 from tfbus.links.zenoh.sessions import (
     CLOSING_TIME,
     LONGEST_NAME,
+    THREAD,
     Addresses,
-    Keeper,
     Settings,
     begin_to_close,
     client_config,
@@ -61,6 +62,8 @@ from tfbus.links.zenoh.sessions import (
     open_session,
     os_error,
     router_config,
+    use_zenoh,
+    wait_until_closed,
 )
 from tfbus.tf_message import MalformedMessageError
 
@@ -122,8 +125,8 @@ class ZenohWire(Wire):
         lease: float | None = None,
     ) -> None:
         self.id: str = os.urandom(16).hex()
-        self._domain = f"tfbus/{domain}"
-        self._own = f"{self._domain}/{robot or NO_ROBOT}"
+        self.domain: str = f"tfbus/{domain}"
+        self.own: str = f"{self.domain}/{robot or NO_ROBOT}"
         self._addresses = deque(endpoints(connect or ()))
         self._is_router = listen is not None
         if listen is not None:
@@ -137,9 +140,12 @@ class ZenohWire(Wire):
                 "the local link"
             )
         self._session: _Session | None = None
-        self._number = 0
-        self._keeper = Keeper(self._keep)
+        self._sessions = 0
         self._failure: OSError | None = None
+        # Set when the thread has something to do.
+        self.changed: threading.Event = threading.Event()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._keep, name=THREAD, daemon=True)
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
         """See `tfbus.links.seams.Wire`. It waits a second for a router, and warns later if there is none.
@@ -153,12 +159,14 @@ class ZenohWire(Wire):
         RuntimeError
             If this process was forked from one that uses zenoh.
         """
-        self._hears = tuple(hears)
-        self._receive, self._warn = receive, warn
+        self.hears, self.receive, self._warn = tuple(hears), receive, warn
         self._tried = anyio.Event()
         self._waker = LoopWaker(self._tell)
         self._waker.bind()
-        self._keeper.start()
+        use_zenoh()
+        # A program that exits without the end of its links has them closed all the same.
+        atexit.register(self._stop)
+        self._thread.start()
         with anyio.move_on_after(math.inf if self._is_router else FIRST_WAIT):
             await self._tried.wait()
         if self._is_router and self._failure is not None:
@@ -182,36 +190,38 @@ class ZenohWire(Wire):
     def send(self, link: str, message: bytes) -> bool:
         """See `tfbus.links.seams.Wire`. It is false while no router is connected, and goes in the order of all."""
         session = self._session
-        return session is not None and session.send(f"{self._domain}/@to/{link}", message)
+        return session is not None and session.send(link, message)
 
     async def close(self) -> None:
         """See `tfbus.links.seams.Wire`. It warns if zenoh goes on closing in the background."""
-        late = await self._keeper.end()
+        self._stop()
+        atexit.unregister(self._stop)
+        late = await wait_until_closed([] if self._thread.ident is None else [self._thread])
         if late is not None:
             self._warn(late)
 
     def _tell(self) -> None:
         """Let `open` return, and warn; on the event loop."""
         self._tried.set()
-        if not self._is_router and not self._keeper.stopped and self._failure is not None:
+        if not self._is_router and not self._stopped and self._failure is not None:
             failure, self._failure = self._failure, None
             self._warn(failure)
 
-    # The thread that opens and closes sessions
+    # The thread that opens and closes sessions, because zenoh's calls block
 
     def _keep(self) -> None:
         """Have one session after another, until the wire is closed."""
         channels: list[str] = []
         while (session := self._connect(channels)) is not None:
             self._wake()
-            while not self._keeper.stopped and (pause := session.look(monotonic())) is not None:
-                self._keeper.wait(pause)
+            while not self._stopped and (pause := session.look(monotonic())) is not None:
+                self._wait(pause)
             self._session = None
             channels = session.channels
-            if self._keeper.stopped:
+            if self._stopped:
                 close_session(session)
                 return
-            session.hearer.end()
+            session.end()
             begin_to_close(session)
             if self._is_router:
                 sleep(PAUSE_TO_BEGIN)
@@ -220,19 +230,19 @@ class ZenohWire(Wire):
     def _connect(self, channels: Iterable[str]) -> "_Session | None":
         """Try one router after the other until one answers; None if the wire is closed, or cannot listen."""
         warns_at = monotonic() + FIRST_WAIT
-        while not self._keeper.stopped:
+        while not self._stopped:
             try:
                 return self._connect_once(channels)
             except OSError as error:
                 failure = error
             self._addresses.rotate(-1)
             if self._is_router:
-                if self._number == 1:
+                if self._sessions == 1:
                     self._failure = failure
                     self._wake()
                     return None
                 # The session before may not have freed the address yet.
-                self._keeper.wait(PAUSE_TO_LISTEN)
+                self._wait(PAUSE_TO_LISTEN)
                 continue
             if monotonic() > warns_at:
                 warns_at = math.inf
@@ -241,28 +251,34 @@ class ZenohWire(Wire):
                 why = "" if "Unable to connect to any of" in str(failure) else f": {failure}"
                 self._failure = OSError(f"no router answers at {where}, and the link goes on trying{why}")
                 self._wake()
-            self._keeper.wait(uniform(*PAUSE) / len(self._addresses))
+            self._wait(uniform(*PAUSE) / len(self._addresses))
         return None
 
     def _connect_once(self, channels: Iterable[str]) -> "_Session":
-        self._number += 1
+        self._sessions += 1
         own = {"id": new_id()} if self._is_router else {"connect/endpoints": [self._addresses[0]]}
-        raw = open_session(self._config, own)
-        hearer = _Hearer(self.id, self._domain, self._hears, self._receive, self._keeper.changed)
-        session = _Session(raw, hearer, self._own, self.id)
+        session = _Session(self, open_session(self._config, own))
         try:
             for channel in channels:
-                session.declare(channel)
+                session.publisher(channel)
             # The link may send something to another one as soon as that has joined.
             self._session = session
-            session.begin(self._domain, self._number, self._hears, is_router=self._is_router)
+            session.begin(self._sessions, is_router=self._is_router)
         except zenoh.ZError as error:
             self._session = None
-            hearer.end()
+            session.end()
             # zenoh may not end it, if a client asks for tokens at this moment.
             begin_to_close(session).join(CLOSING_TIME)
             raise os_error(error, "the session with a router broke at once") from error
         return session
+
+    def _wait(self, seconds: float) -> None:
+        self.changed.wait(seconds)
+        self.changed.clear()
+
+    def _stop(self) -> None:
+        self._stopped = True
+        self.changed.set()
 
     def _wake(self) -> None:
         # The event loop may have ended.
@@ -271,85 +287,69 @@ class ZenohWire(Wire):
 
 
 class _Session:
-    """One session of a link, with its declarations and publishers."""
+    """One session of a wire, with its declarations and publishers, and the links that are present in it.
 
-    def __init__(self, session: zenoh.Session, hearer: "_Hearer", own: str, link: str) -> None:
-        self.hearer = hearer
+    zenoh's threads call all that takes something. zenoh's objects hold these methods, so `close` lets go of them.
+    """
+
+    def __init__(self, wire: ZenohWire, session: zenoh.Session) -> None:
+        self._wire = wire
         self._session = session
-        self._own = own
-        self._link = link
-        self._sender = bytes.fromhex(link)
+        self._sender = bytes.fromhex(wire.id)
         self._publishers: dict[str, tuple[zenoh.Publisher, float]] = {}
         # zenoh refuses to undeclare a publisher by which the event loop is publishing.
         self._publishing = threading.Lock()
         self._declared: list[object] = []
         self._neighbours: Neighbours | None = None
+        self._broken = False
+        self._lock = threading.Lock()
+        self._ended = False
+        # The number of the newest session of each link that is present, and which of the wire's `hears` is for it.
+        self._present: dict[str, tuple[int, int]] = {}
+        # When each link that is present without a token has left.
+        self._leaving: dict[str, float] = {}
 
-    @property
-    def channels(self) -> list[str]:
-        return list(self._publishers)
+    # For the wire
 
-    def look(self, now: float) -> float | None:
-        """Tell of links that have left; returns the s until the next look, or None if another session is needed."""
-        if self.hearer.broken or (self._neighbours is not None and self._neighbours.are_silent(now)):
-            return None
-        return self.hearer.let_leave(now)
-
-    def begin(self, domain: str, number: int, hears: Sequence[Hearing], *, is_router: bool) -> None:
+    def begin(self, number: int, *, is_router: bool) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
-        session, hearer, declared = self._session, self.hearer, self._declared
+        session, wire, declared = self._session, self._wire, self._declared
         if is_router:
             self._neighbours = Neighbours(session)
             declared += self._neighbours.declared
         else:
-            declared.append(session.info.declare_transport_events_listener(_directly(hearer.take_event)))
-        for index, (robots, channel) in enumerate(hears):
-            take = _directly(partial(hearer.take_published, index))
-            key = f"{domain}/{robots_expression(robots)}/{channel}/*"
+            declared.append(session.info.declare_transport_events_listener(_directly(self._take_event)))
+        for index, (robots, channel) in enumerate(wire.hears):
+            take = _directly(partial(self._take_published, index))
+            key = f"{wire.domain}/{robots_expression(robots)}/{channel}/*"
             declared.append(session.declare_subscriber(key, take, allowed_origin=_REMOTE))
-        take = _directly(hearer.take_sent)
-        declared.append(session.declare_subscriber(f"{domain}/@to/{self._link}", take, allowed_origin=_REMOTE))
+        take = _directly(self._take_sent)
+        declared.append(session.declare_subscriber(f"{wire.domain}/@to/{wire.id}", take, allowed_origin=_REMOTE))
         liveliness = session.liveliness()
-        for index, (robots, _) in enumerate(hears):
-            take = _directly(partial(hearer.take_token, index))
-            key = f"{domain}/{robots_expression(robots)}/@alive/*/*"
+        for index, (robots, _) in enumerate(wire.hears):
+            take = _directly(partial(self._take_token, index))
+            key = f"{wire.domain}/{robots_expression(robots)}/@alive/*/*"
             declared.append(liveliness.declare_subscriber(key, take, history=True))
-        declared.append(liveliness.declare_token(f"{self._own}/@alive/{self._link}/{number}"))
+        declared.append(liveliness.declare_token(f"{wire.own}/@alive/{wire.id}/{number}"))
         if not is_router and not session.info.transports():
             # It broke before anybody listened.
-            hearer.broken = True
+            self._broken = True
 
-    def declare(self, channel: str) -> tuple[zenoh.Publisher, float]:
-        """A new publisher for a channel, and since when it is there."""
-        if len(self._publishers) >= MAX_CHANNELS:
-            del self._publishers[next(iter(self._publishers))]
-        key = f"{self._own}/{channel}/{self._link}"
-        publisher = self._session.declare_publisher(key, congestion_control=_DROP, allowed_destination=_REMOTE)
-        self._publishers[channel] = publisher, monotonic()
-        return self._publishers[channel]
+    def look(self, now: float) -> float | None:
+        """Tell of the links that have left by now; the s until the next look, or None to have another session."""
+        if self._broken or (self._neighbours is not None and self._neighbours.are_silent(now)):
+            return None
+        with self._lock:
+            for link in [link for link, due in self._leaving.items() if due <= now]:
+                self._leave(link)
+            return min([PERIOD, *(due - now for due in self._leaving.values())])
 
-    def is_heard(self, channel: str) -> bool:
-        try:
-            with self._publishing:
-                publisher, since = self._publishers.get(channel) or self.declare(channel)
-                return bool(publisher.matching_status.matching) or monotonic() < since + SETTLED  # type: ignore[attr-defined]
-        except zenoh.ZError:
-            # The session has just ended.
-            return False
-
-    def publish(self, channel: str, message: bytes) -> None:
-        with suppress(zenoh.ZError), self._publishing:
-            publisher, _ = self._publishers.get(channel) or self.declare(channel)
-            publisher.put(message)
-
-    def send(self, key: str, message: bytes) -> bool:
-        try:
-            self._session.put(
-                key, message, attachment=self._sender, congestion_control=_DROP, allowed_destination=_REMOTE
-            )
-        except zenoh.ZError:
-            return False
-        return True
+    def end(self) -> None:
+        """Have all links leave, and take nothing any more; in any thread."""
+        with self._lock:
+            self._ended = True
+            for link in list(self._present):
+                self._leave(link)
 
     def close(self) -> None:
         """Close the session; blocks."""
@@ -366,60 +366,74 @@ class _Session:
             self._publishers.clear()
             self._neighbours = None
 
+    # Sending
 
-class _Hearer:
-    """Receives from one session, in zenoh's threads; it holds none of zenoh's objects, because they hold it."""
+    @property
+    def channels(self) -> list[str]:
+        return list(self._publishers)
 
-    def __init__(
-        self, link: str, domain: str, hears: Sequence[Hearing], receive: Receive, changed: threading.Event
-    ) -> None:
-        self.broken = False
-        self._link = link
-        self._rest = len(domain) + 1
-        self._hears = hears
-        self._receive = receive
-        self._changed = changed
-        self._lock = threading.Lock()
-        self._ended = False
-        # The number of the newest session of each link that is present, and which of `hears` is for it.
-        self._present: dict[str, tuple[int, int]] = {}
-        # When each link that is present without a token has left.
-        self._leaving: dict[str, float] = {}
+    def publisher(self, channel: str) -> tuple[zenoh.Publisher, float]:
+        """The publisher for a channel, and since when it is there; raises `zenoh.ZError` if it is new."""
+        if channel not in self._publishers:
+            if len(self._publishers) >= MAX_CHANNELS:
+                del self._publishers[next(iter(self._publishers))]
+            key = f"{self._wire.own}/{channel}/{self._wire.id}"
+            publisher = self._session.declare_publisher(key, congestion_control=_DROP, allowed_destination=_REMOTE)
+            self._publishers[channel] = publisher, monotonic()
+        return self._publishers[channel]
 
-    def take_published(self, index: int, sample: zenoh.Sample) -> None:
+    def is_heard(self, channel: str) -> bool:
+        # The session may just have ended.
+        with suppress(zenoh.ZError), self._publishing:
+            publisher, since = self.publisher(channel)
+            return bool(publisher.matching_status.matching) or monotonic() < since + SETTLED  # type: ignore[attr-defined]
+        return False
+
+    def publish(self, channel: str, message: bytes) -> None:
+        with suppress(zenoh.ZError), self._publishing:
+            self.publisher(channel)[0].put(message)
+
+    def send(self, link: str, message: bytes) -> bool:
+        key, sender = f"{self._wire.domain}/@to/{link}", self._sender
+        with suppress(zenoh.ZError):
+            self._session.put(key, message, attachment=sender, congestion_control=_DROP, allowed_destination=_REMOTE)
+            return True
+        return False
+
+    # Receiving
+
+    def _take_published(self, index: int, sample: zenoh.Sample) -> None:
         link = str(sample.key_expr).rpartition("/")[2]
         with self._lock:
             known = self._present.get(link)
             if known is not None and known[1] == index:
                 if link in self._leaving:
                     self._leaving[link] = monotonic() + LAST_WORDS
-                self._receive(link, _content(sample))
+                self._wire.receive(link, _content(sample))
 
-    def take_sent(self, sample: zenoh.Sample) -> None:
+    def _take_sent(self, sample: zenoh.Sample) -> None:
         sender = b"" if sample.attachment is None or len(sample.attachment) != 16 else sample.attachment.to_bytes()
         with self._lock:
             if sender and not self._ended:
-                self._receive(sender.hex(), _content(sample))
+                self._wire.receive(sender.hex(), _content(sample))
 
-    def take_token(self, index: int, sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)
-        found = _TOKEN.fullmatch(key, self._rest)
+    def _take_token(self, index: int, sample: zenoh.Sample) -> None:
+        wire, key = self._wire, str(sample.key_expr)[len(self._wire.domain) + 1 :]
+        found = _TOKEN.fullmatch(key)
         if found is None:
             if sample.kind == zenoh.SampleKind.PUT:
-                self._receive("", MalformedMessageError("token", f"no link has the token {key[self._rest :][:100]}"))
-            return
-        if found["link"] == self._link:
+                wire.receive("", MalformedMessageError("token", f"no link has the token {key[:100]}"))
             return
         link, number = found["link"], int(found["number"])
         robot = found["robot"] if found["robot"] != NO_ROBOT else ""
-        if index != next((place for place, one in enumerate(self._hears) if one.matches(robot)), None):
+        if link == wire.id or index != next((k for k, one in enumerate(wire.hears) if one.matches(robot)), None):
             return
         with self._lock:
             known = self._present.get(link)
             if sample.kind == zenoh.SampleKind.DELETE:
                 if known is not None and known[0] == number:
                     self._leaving[link] = monotonic() + LAST_WORDS
-                    self._changed.set()
+                    wire.changed.set()
                 return
             if known is None:
                 is_news = len(self._present) < MAX_LINKS
@@ -428,31 +442,17 @@ class _Hearer:
             if is_news and not self._ended:
                 self._leave(link)
                 self._present[link] = number, index
-                self._receive(link, Joined(robot))
+                wire.receive(link, Joined(robot))
 
-    def let_leave(self, now: float) -> float:
-        """Tell of the links that have left by now; returns the s until the next look."""
-        with self._lock:
-            for link in [link for link, due in self._leaving.items() if due <= now]:
-                self._leave(link)
-            return min([PERIOD, *(due - now for due in self._leaving.values())])
-
-    def take_event(self, event: zenoh.TransportEvent) -> None:
+    def _take_event(self, event: zenoh.TransportEvent) -> None:
         if event.kind == zenoh.SampleKind.DELETE:
-            self.broken = True
-            self._changed.set()
-
-    def end(self) -> None:
-        """Have all links leave, and take nothing any more; in any thread."""
-        with self._lock:
-            self._ended = True
-            for link in list(self._present):
-                self._leave(link)
+            self._broken = True
+            self._wire.changed.set()
 
     def _leave(self, link: str) -> None:
         if self._present.pop(link, None) is not None:
             self._leaving.pop(link, None)
-            self._receive(link, Left())
+            self._wire.receive(link, Left())
 
 
 def _directly(callback: Callable[[Any], object]) -> Any:
