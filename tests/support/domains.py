@@ -394,7 +394,7 @@ class Process:
     def start(self) -> None:
         for end in self.ends:
             finish(end.open())
-            end.attach()
+            end.relay.attach(end)
         for wire in self.wires:
             wire.network.add(wire)
         self.work()

@@ -59,7 +59,7 @@ class RosEnd:
         self.errors: list[Exception] = []
         self.report = SendReport(self.errors.append)
         self.carrier.connect(self.receive, self.report)
-        self.endpoint.attach()
+        self.endpoint.relay.attach(self.endpoint)
 
     def receive(self, item: Received) -> None:
         self.endpoint.handle(item.sender, item.content)

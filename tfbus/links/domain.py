@@ -162,7 +162,7 @@ class DomainEnd(Endpoint):
         # Answering takes half of the event loop's time at most.
         self._questions: dict[tuple[str, Kind], bytes] = {}
         self._answers_due = -inf
-        self._waiting: dict[str, Joined] = {}
+        self._waiting: dict[str, str] = {}
         self._signed_at = self._sign_due = -inf
         self._sign_period = SIGN_PERIOD
 
@@ -170,9 +170,6 @@ class DomainEnd(Endpoint):
 
     async def open(self) -> None:
         await self._wire.open(list(self._rates), self.take, self._warn_of_wire)
-
-    def attach(self) -> None:
-        self.relay.attach(self)
 
     def detach(self) -> None:
         self.lookups.close()
@@ -304,8 +301,8 @@ class DomainEnd(Endpoint):
             received = Received(link, item, urgent=isinstance(item, (Joined, Left)))
         self.host.receive(received)
 
-    def _joined(self, sender: str, joined: Joined) -> None:
-        peer = self._join(sender, joined.robot)
+    def _join(self, sender: str, robot: str) -> Peer | None:
+        peer = super()._join(sender, robot)
         if peer is not None:
             self.clocks.joined(sender)
             peer.rate = next((rate for one, rate in self._rates.items() if one.matches(peer.robot)), inf)
@@ -319,7 +316,8 @@ class DomainEnd(Endpoint):
                     self._history.joined(sender)
             self.host.stir()
         elif sender not in self.peers and len(self._waiting) < MOST_WAITING:
-            self._waiting[sender] = joined
+            self._waiting[sender] = robot
+        return peer
 
     def _take(self, sender: str, content: Any) -> None:
         if isinstance(content, _Due):
@@ -480,7 +478,7 @@ class DomainEnd(Endpoint):
 
     def _begin_anew(self, peer: Peer, source: Provenance) -> None:
         """Forget the older samples of a bus whose stamps have jumped, because the newer ones do not go on from them."""
-        frames = self.relay.begin_anew(source.origin)
+        frames = self.relay.take_off(lambda shown: shown.origin == source.origin, moving=True)
         step = self.clocks.step_of(source.origin)
         if step:
             self.bus._announce(PeerClockStepped(self.bus.clock.now(), self.name, peer.id, to_seconds(step), frames))
@@ -585,18 +583,18 @@ class DomainEnd(Endpoint):
         super()._leave(sender)
         if self._waiting and len(self.peers) < MAX_PEERS:
             link = next(iter(self._waiting))
-            self._joined(link, self._waiting.pop(link))
+            self._join(link, self._waiting.pop(link))
 
     def _lose(self, peer: Peer) -> tuple[str, ...]:
         self._end_history(peer.id, peer)
         lost = self._forget(peer)
-        frames = tuple(self.relay.frames_of(lambda source: source.origin in lost))
+        frames = self.relay.frames_of(lambda shown: shown.origin in lost)
         self._withdraw(lost)
         return frames
 
     def _withdraw(self, lost: Collection[bytes]) -> None:
         if self.drop_lost and lost:
-            self.relay.withdraw(lambda source: source.origin in lost)
+            self.relay.take_off(lambda shown: shown.origin in lost)
 
     def _forget(self, peer: Peer) -> set[bytes]:
         """Forget a peer; returns the buses that are no longer reached."""

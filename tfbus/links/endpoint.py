@@ -113,21 +113,8 @@ class Endpoint(Outbox, ABC):
         """Connect to the network; raises `OSError` if it cannot."""
 
     @abstractmethod
-    def attach(self) -> None:
-        """Join the bus: from now on, all that is latched or published gathers here.
-
-        Raises
-        ------
-        BusClosedError
-        """
-
-    @abstractmethod
     def detach(self) -> None:
         """Leave the bus; its peers are forgotten, and their frames stay."""
-
-    def clock_jumped_back(self) -> None:
-        """Take samples with the stamps of earlier ones for news."""
-        self.relay.clock_jumped_back()
 
     def clock_statistics(self) -> tuple[PeerClock, ...]:
         """The clocks of the peers, as far as they tell their times."""
@@ -166,7 +153,7 @@ class Endpoint(Outbox, ABC):
         """Handle a part of an item; nothing in it makes this raise."""
         try:
             if isinstance(content, Joined):
-                self._joined(sender, content)
+                self._join(sender, content.robot)
             elif isinstance(content, Left):
                 self._leave(sender)
             elif isinstance(content, MalformedMessageError):
@@ -207,10 +194,6 @@ class Endpoint(Outbox, ABC):
     @abstractmethod
     def _lose(self, peer: Peer) -> tuple[str, ...]:
         """Forget the frames of a lost peer; returns them, sorted."""
-
-    def _joined(self, sender: str, joined: Joined) -> None:
-        """Note that a peer is there."""
-        self._join(sender, joined.robot)
 
     def _join(self, sender: str, robot: str) -> Peer | None:
         """Note that a peer is there; returns it if that is new, and there is a place."""

@@ -298,7 +298,7 @@ class Link(AsyncOnly):
             waker.bind()
         try:
             await self._end.open()
-            self._end.attach()
+            self._end.relay.attach(self._end)
         except BaseException:
             await self._end.network.close()
             raise
@@ -415,7 +415,7 @@ class Link(AsyncOnly):
             self._receive_queue.discard_moving()
             if self._whole is not None and self._whole.moving:
                 self._whole = None
-            self._end.clock_jumped_back()
+            self._end.relay.clock_jumped_back()
 
 
 class DomainLink(Link):

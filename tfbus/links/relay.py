@@ -70,7 +70,7 @@ class Outbox:
     views : dict of str to View
         The frames that the links of each robot bring by this link.
     own : View or None
-        The view of them that this link tells; None if it tells no entries.
+        The view of them that this link tells; None if it tells no entries, because its world has no origins.
     max_offset : float
         Clocks that differ by so many ns at most are near enough.
     """
@@ -183,21 +183,15 @@ class Relay:
         self._reached: set[bytes] = set()
         self._remembers = False
 
-    def attach(self, outbox: Outbox, foreign: bool = False) -> None:
+    def attach(self, outbox: Outbox) -> None:
         """Give a link the latched samples, the entries of the other links, and all samples from now on.
-
-        Parameters
-        ----------
-        outbox : Outbox
-        foreign : bool
-            Whether it is a link to a world whose samples have no origin.
 
         Raises
         ------
         BusClosedError
         """
         # A bus with two links may hear a sample that has gone through a world without origins by either.
-        self._remembers = self._remembers or foreign or bool(self._outboxes)
+        self._remembers = self._remembers or outbox.own is None or bool(self._outboxes)
         if self._registration is None:
             self._registration = self._bus.subscribe(self._on_batch, self._on_removal)
         self._outboxes.append(outbox)
@@ -312,28 +306,39 @@ class Relay:
         ways = (way for other in self._outboxes if other is not outbox for way in other.ways())
         return dict(sorted(ways, key=lambda way: len(way[1]), reverse=True))
 
-    def frames_of(self, owns: Callable[[Provenance], bool]) -> list[str]:
+    def frames_of(self, owns: Callable[[Provenance], bool]) -> tuple[str, ...]:
         """The frames on the bus whose newest sample has such a source, sorted."""
         entries = self.replica.entries.values()
-        return sorted(known.frame for known in entries if known.shown is not None and owns(known.shown))
+        return tuple(sorted(known.frame for known in entries if known.shown is not None and owns(known.shown)))
 
-    def withdraw(self, owns: Callable[[Provenance], bool]) -> None:
-        """Withdraw the frames whose newest samples have such a source."""
+    def take_off(
+        self,
+        owns: Callable[[Provenance], bool],
+        removal: Callable[[], Provenance | None] = lambda: None,
+        *,
+        moving: bool = False,
+    ) -> tuple[str, ...]:
+        """Withdraw or remove the frames whose newest samples have such a source; returns them, sorted.
+
+        Parameters
+        ----------
+        owns : callable
+        removal : callable
+            Returns the source of each removal; by default None, to withdraw the frames.
+        moving : bool
+            Whether static frames stay.
+        """
+        gone = []
         for frame in self.frames_of(owns):
             known = self.replica.entries.get(frame)
             # A subscriber may have changed things meanwhile.
-            if not self._bus.closed and known is not None and known.shown is not None and owns(known.shown):
-                self.remove(frame, None)
-
-    def begin_anew(self, origin: bytes) -> tuple[str, ...]:
-        """Forget the samples of the moving frames of a bus, on this bus alone; returns the frames, sorted."""
-        found = []
-        for frame in self.frames_of(lambda source: source.origin == origin):
-            known = self.replica.entries.get(frame)
-            if not self._bus.closed and known is not None and known.sample is not None and not known.sample.static:
-                self.remove(frame, None)
-                found.append(frame)
-        return tuple(found)
+            is_there = not self._bus.closed and known is not None and known.shown is not None and owns(known.shown)
+            if known is not None and is_there and not (moving and known.sample is not None and known.sample.static):
+                self.remove(frame, removal())
+                # It may come again unchanged.
+                known.passed = None
+                gone.append(frame)
+        return tuple(gone)
 
     def clock_of(self, frame: str) -> str:
         """The clock that stamps a frame beside this bus's, in words; empty if they agree, or that is not known."""

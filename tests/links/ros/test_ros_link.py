@@ -306,7 +306,7 @@ def test_after_a_jump_back_of_the_clock_the_stamps_of_before_are_news(end: RosEn
         end.hear(moving("map", "base", 1, 5.0))
         end.hear(static("map", "lidar", 2.0), static=True)
         assert len(end.heard) == 2 + jumps
-        end.endpoint.clock_jumped_back()
+        end.endpoint.relay.clock_jumped_back()
 
 
 def test_positions_of_joints_are_handed_on_and_what_comes_of_that_is_counted() -> None:

@@ -167,9 +167,6 @@ class ForeignEnd(Endpoint):
     async def open(self) -> None:
         await self._carrier.open(self.host.receive, self.report)
 
-    def attach(self) -> None:
-        self.relay.attach(self, foreign=True)
-
     def detach(self) -> None:
         self.peers.clear()
         self.relay.detach(self)
@@ -199,15 +196,10 @@ class ForeignEnd(Endpoint):
             self._carrier.send(Turn(entries, changes, time))
 
     def _lose(self, peer: Peer) -> tuple[str, ...]:
-        frames = self.relay.frames_of(lambda source: source.peer is peer)
-        for frame in frames if self.drop_lost else ():
-            known = self.relay.replica.entries.get(frame)
-            # A subscriber that hears of one removal may have removed or published others, or closed the bus.
-            if not self.bus.closed and known is not None and known.shown is not None and known.shown.peer is peer:
-                self.relay.remove(frame, self._source(peer))
-                # The next peer may bring the frame unchanged.
-                known.passed = None
-        return tuple(frames)
+        frames = self.relay.frames_of(lambda shown: shown.peer is peer)
+        if self.drop_lost:
+            self.relay.take_off(lambda shown: shown.peer is peer, lambda: self._source(peer))
+        return frames
 
     def _source(self, peer: Peer) -> Provenance:
         """The source of the next batch of this world: it has the name and the next number of this bus."""
