@@ -53,17 +53,14 @@ class Channels:
     wire : Wire
     bus : bytes
         The sender's own bus.
-    partial : bool
-        Whether this link sends and takes some frames only.
     slow_rate : float
         How often the newest samples are sent, in Hz.
     report : SendReport
     """
 
-    def __init__(self, wire: Wire, bus: bytes, partial: bool, slow_rate: float, report: SendReport) -> None:
+    def __init__(self, wire: Wire, bus: bytes, slow_rate: float, report: SendReport) -> None:
         self._wire = wire
         self._bus = bus
-        self._partial = partial
         self._report = report
         self._all = _Channel(None, [ALL])
         self._slow = _Channel(None, [SLOW])
@@ -105,7 +102,7 @@ class Channels:
         """Publish a sign of life on each channel."""
         for channel in list(self._channels):
             if self._is_heard(channel, now):
-                claim = view.claim(now, channel.frames)._replace(partial=self._partial)
+                claim = view.claim(now, channel.frames)
                 sign = Outgoing(Kind.SIGN, self._bus, channel.number, claim, self._time, reach, serves, clocks)
                 first, *others = channel.names
                 self._wire.publish(first, write_message(sign))

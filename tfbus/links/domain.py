@@ -145,7 +145,7 @@ class DomainEnd(Endpoint):
         channels = {inf: channel, 0.0: QUIET}
         self._rates = {Hearing(pattern, channels.get(rate, SLOW)): rate for pattern, rate in rates.items()}
         self._bus = self.relay.replica.origin
-        self._channels = Channels(wire, self._bus, self.frames is not None, slow_rate, self.report)
+        self._channels = Channels(wire, self._bus, slow_rate, self.report)
         self.own: View = self._view_of(self._robot)
         self._agreement = Agreement()
         max_offset, corrects = as_duration(options.get("max_offset", 0.02), "max_offset"), options.get("correct_clocks")
@@ -180,8 +180,11 @@ class DomainEnd(Endpoint):
     def work(self) -> float:
         now = self._now()
         if self._questions and now >= self._answers_due:
-            (sender, kind) = next(iter(self._questions))
-            self.handle(sender, _Due(kind, self._questions.pop((sender, kind))))
+            sender, kind = next(iter(self._questions))
+            # An answer must not overtake a batch in the outbox.
+            self.send()
+            answer = self._answer if kind is Kind.QUESTION else self._tell_past
+            self.guarded(answer, sender, self._questions.pop((sender, kind)))
             after = self._now()
             now, self._answers_due = after, 2 * after - now
         for peer in self._history.overdue():
@@ -274,8 +277,7 @@ class DomainEnd(Endpoint):
     def _meet(self, peer: Peer) -> None:
         """Send a new peer the entries that this link brings, or an empty meeting if they are too many."""
         self.send()
-        claim = self.own.claim(self._now())._replace(partial=self.frames is not None)
-        clocks = self.clocks.section(answers=False)
+        claim, clocks = self.own.claim(self._now()), self.clocks.section(answers=False)
         out = Outgoing(Kind.MEETING, self._bus, 0, claim, self.time, self._reach(), self._serves, clocks)
         entries = [known.told for known in islice(self.own.brought(self), CHUNK + 1)]
         try:
@@ -320,9 +322,7 @@ class DomainEnd(Endpoint):
         return peer
 
     def _take(self, sender: str, content: Any) -> None:
-        if isinstance(content, _Due):
-            self._answer_due(sender, content)
-        elif isinstance(content, Text):
+        if isinstance(content, Text):
             self._take_text(sender, content)
         else:
             self._take_message(sender, content)
@@ -338,15 +338,6 @@ class DomainEnd(Endpoint):
                 raise MalformedMessageError("too many questions", f"{MOST_QUESTIONS} wait for an answer")
             self._questions[key] = text.data
             self.host.stir()
-
-    def _answer_due(self, sender: str, question: "_Due") -> None:
-        fields = read_fields(question.data)
-        # An answer must not overtake a batch in the outbox.
-        self.send()
-        if question.kind is Kind.QUESTION:
-            self._answer(sender, fields)
-        else:
-            self._tell_past(sender, fields)
 
     def _take_message(self, sender: str, heard: Heard) -> None:
         peer = self.peers.get(sender)
@@ -639,7 +630,8 @@ class DomainEnd(Endpoint):
 
     # Answers
 
-    def _answer(self, sender: str, fields: dict[str, Any]) -> None:
+    def _answer(self, sender: str, question: bytes) -> None:
+        fields = read_fields(question)
         since, names = fields.get("since"), fields.get("frames")
         if type(since) is not int or not 0 <= since < 2**64:
             raise MalformedMessageError("text", f"a question since {since!r}"[:100])
@@ -653,7 +645,6 @@ class DomainEnd(Endpoint):
         limit = CHUNK
         while limit:
             entries, claim = self.own.changes(since, self._now(), frames, limit)
-            claim = claim._replace(partial=self.frames is not None)
             out = Outgoing(Kind.ANSWER, self._bus, 0, claim, None, self._reach())
             try:
                 message = write_message(out, entries)
@@ -663,7 +654,8 @@ class DomainEnd(Endpoint):
                 self._wire.send(sender, message)
                 return
 
-    def _tell_past(self, sender: str, fields: dict[str, Any]) -> None:
+    def _tell_past(self, sender: str, question: bytes) -> None:
+        fields = read_fields(question)
         seconds, after = fields.get("seconds"), fields.get("after")
         if isinstance(seconds, bool) or not isinstance(seconds, (int, float)) or not isinstance(after, str):
             raise MalformedMessageError("text", "a question for the past without a time and a name")
@@ -707,10 +699,6 @@ class DomainEnd(Endpoint):
         forgotten = [self.views.pop(robot) for robot in absent[: max(len(absent) - MOST_ROBOTS, 0)]]
         if forgotten:
             self.relay.replica.narrow(forgotten, keep_removals=True)
-
-
-class _Due(Text):
-    """A question whose turn has come."""
 
 
 def check_name(what: str, name: str, pattern: str, letters: str) -> str:

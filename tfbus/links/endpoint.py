@@ -7,7 +7,7 @@ another world. Nothing that a peer sends makes either of them raise.
 import logging
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from copy import copy
 from math import inf
 from typing import Any, Protocol
@@ -151,15 +151,19 @@ class Endpoint(Outbox, ABC):
 
     def handle(self, sender: str, content: Any) -> None:
         """Handle a part of an item; nothing in it makes this raise."""
+        if isinstance(content, Joined):
+            self.guarded(self._join, sender, content.robot)
+        elif isinstance(content, Left):
+            self.guarded(self._leave, sender)
+        elif isinstance(content, MalformedMessageError):
+            self.reject(sender, content.reason, content)
+        else:
+            self.guarded(self._take, sender, content)
+
+    def guarded(self, work: Callable[..., object], sender: str, *told: Any) -> None:
+        """Do some work with what a peer has sent; its errors are counted and told."""
         try:
-            if isinstance(content, Joined):
-                self._join(sender, content.robot)
-            elif isinstance(content, Left):
-                self._leave(sender)
-            elif isinstance(content, MalformedMessageError):
-                self.reject(sender, content.reason, content)
-            else:
-                self._take(sender, content)
+            work(sender, *told)
         except MalformedMessageError as error:
             self.reject(sender, error.reason, error)
         except Exception as error:  # noqa: BLE001 - no peer, and no subscriber, may end the event loop

@@ -556,7 +556,7 @@ class View:
             for known in filter(None, map(self._replica.entries.get, frames)):
                 if self in known.views:
                     digest ^= known.digest
-        return Claim(self._replica.sequence, self._replica.sequence, digest)
+        return Claim(self._replica.sequence, self._replica.sequence, digest, partial=self._frames is not None)
 
     def changes(
         self, since: int, now: float, frames: Collection[str] | None = None, limit: int = CHUNK
