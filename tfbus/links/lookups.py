@@ -10,7 +10,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from time import monotonic
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -176,12 +176,13 @@ class RemoteLookups:
                     raise LookupTimeoutError(target=target, source=source, timeout=limit, missing=missing) from missing
 
     async def _find_server(self, robot: str | None, until: float) -> str:
-        with anyio.move_on_after(min(PATIENCE, max(until - anyio.current_time(), 0.0))):
-            while self._is_open and self._server_of(robot) is None:
-                await self._changed.wait()
+        server = self._server_of(robot)
+        if server is None:
+            with anyio.move_on_after(min(PATIENCE, max(until - anyio.current_time(), 0.0))):
+                while self._is_open and (server := self._server_of(robot)) is None:
+                    await self._changed.wait()
         if not self._is_open:
             raise self._error(robot, "lost", "this link has ended")
-        server = self._server_of(robot)
         if server is None:
             raise self._error(robot, "absent", "nobody offers it")
         return server
@@ -196,7 +197,8 @@ class RemoteLookups:
         pending = self._pending[number] = _Pending(server)
         answered = False
         try:
-            if not self._put(server, number, write_question(replace(question, timeout=timeout))):
+            question.timeout = timeout
+            if not self._put(server, number, write_question(question)):
                 raise self._error(robot, "silent", "the question could not be sent")
             with anyio.move_on_after(timeout + PATIENCE):
                 await pending.done.wait()

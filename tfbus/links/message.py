@@ -527,7 +527,7 @@ def _with_belief(sample: ReceivedTransform, belief: Belief | None) -> FromLink:
 # Lookups
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class RemoteQuestion(PlainData):
     """A lookup for the buffer of another process; the fields are the arguments of `tfbus.Buffer.lookup`.
 
@@ -633,7 +633,7 @@ def _read(data: bytes) -> dict[str, Any]:
     if len(data) > MAX_TEXT:
         raise ValueError(f"{len(data)} bytes, more than {MAX_TEXT}")
     try:
-        fields = json.loads(data, parse_int=_integer)
+        fields = _decoder.decode(data.decode())
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     if not isinstance(fields, dict):
@@ -652,6 +652,10 @@ def _integer(digits: str) -> int:
     if not STAMP_MIN <= number <= STAMP_MAX:
         raise ValueError(f"an integer of {len(digits)} digits does not fit 64 bits")
     return number
+
+
+# `json.loads` would make one for each text.
+_decoder = json.JSONDecoder(parse_int=_integer)
 
 
 def _shown(name: str) -> str:
