@@ -53,7 +53,7 @@ from tfbus.tf_message import MalformedMessageError
 
 SIGN_PERIOD = 1.0
 SIGN_PERIOD_EACH = 0.05
-LONGEST_SIGN_PERIOD_EACH = 0.1
+LONGEST_SIGN_PERIOD_EACH = 0.15
 """s; a link signs `SIGN_PERIOD` after it has sent something or met a peer, and then after twice that time each time, up
 to the `rest` of its wire. A sign goes to all peers, so with many peers the first and the longest period are at least
 `SIGN_PERIOD_EACH` and `LONGEST_SIGN_PERIOD_EACH` for each peer."""

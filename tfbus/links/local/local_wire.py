@@ -24,11 +24,11 @@ more, and cannot answer.
 
 Connecting
 ----------
-The younger link connects to the older ones, when it opens and whenever it looks into the directory; so two
-links never connect to each other, and one that was missed is met at the next look. A link looks often at first, and
-then once a second. A younger link that has not connected by then may have been killed: a connection on which nothing is
-said finds that out, and then its name is removed. An id in use is not taken over: another connection of that id is
-refused while the first one is there.
+The younger link connects to the older ones, when it opens and whenever it looks into the directory; so two links never
+connect to each other, and one that was missed is met at the next look. A link looks often at first, and then every two
+seconds. A younger link that has not connected by then may have been killed: a connection on which nothing is said finds
+that out, and then its name is removed. An id in use is not taken over: another connection of that id is refused while
+the first one is there.
 
 Present and lost
 ----------------
@@ -73,7 +73,7 @@ MOST_UNFINISHED: Final = 2**26
 """Bytes of all unfinished messages together."""
 PATIENCE: Final = 10.0
 """s until a connection has to be met."""
-_OFTEN, _RARELY = 0.01, 1.0
+_OFTEN, _RARELY = 0.01, 2.0
 _FLUSH_TIME = 1.0
 
 
