@@ -333,17 +333,24 @@ def _write_belief(sample: TransformStamped) -> bytes:
 # Reading
 
 
-class _Batch(NamedTuple):
-    """A batch as the head of a message tells it; its tags are the authority of each sample and whether it is static.
+class _Head(NamedTuple):
+    """The part of a message before its samples, and where it ends.
 
-    It has as many beliefs as samples if one of them has a covariance, and otherwise none.
+    Attributes
+    ----------
+    entries : list
+        Each with the number of its samples, which are not there yet.
+    tags : list
+        The authority of each sample, and whether it is static.
+    beliefs : dict
+        By the places of the samples that have a covariance.
     """
 
-    origin: bytes
-    clock: int
-    sequence: int
-    tags: Sequence[tuple[str, bool]]
-    beliefs: Sequence[Belief | None]
+    heard: Heard
+    end: int
+    entries: list[tuple[ReceivedBatch | RemovedFrame, int]]
+    tags: list[tuple[str, bool]]
+    beliefs: dict[int, Belief]
 
 
 def kind_of(data: bytes) -> Kind | None:
@@ -382,14 +389,13 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
     if len(data) > MAX_BYTES:
         raise MalformedMessageError("oversized", f"{len(data)} bytes, more than {MAX_BYTES}")
     try:
-        heard, told, end = yield from _read_head(kind, data)
+        heard, end, told, tags, beliefs = yield from _read_head(kind, data)
     except (struct.error, IndexError):
         detail = f"the head of a message of {len(data)} bytes is cut off or inconsistent"
         raise MalformedMessageError("head", detail) from None
     except UnicodeDecodeError:
         raise MalformedMessageError("head", "a name in a message is no UTF-8") from None
-    tags = [tag for entry in told if isinstance(entry, _Batch) for tag in entry.tags]
-    samples: list[ReceivedTransform | None] = []
+    samples: list[FromLink | None] = []
     if tags or end < len(data):
         payload = data[end:]
         if len(data) > _LARGE:
@@ -399,28 +405,22 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
                 heard.errors += decoded.errors
                 yield None
         else:
-            samples, heard.errors = decode(payload, tags, ReceivedTransform)
+            decoded = decode(payload, tags, ReceivedTransform)
+            samples, heard.errors = [*decoded.samples], decoded.errors
+    for place, belief in beliefs.items():
+        sample = samples[place]
+        samples[place] = None if sample is None else _with_belief(sample, belief)
     place = size = 0
-    for entry in told:
+    for entry, count in told:
         if size >= _PART:
             heard.goes_on = True
             yield heard
             size, heard = 0, replace(heard, time=None, entries=[], errors=[], continues=True, goes_on=False)
-        if isinstance(entry, RemovedFrame):
-            size += 1
-            heard.entries.append(entry)
-            continue
-        come = samples[place : place + len(entry.tags)]
-        valid: list[FromLink]
-        if entry.beliefs:
-            pairs = zip(come, entry.beliefs, strict=True)
-            valid = [_with_belief(sample, belief) for sample, belief in pairs if sample is not None]
-        else:
-            valid = [sample for sample in come if sample is not None]
-        place += len(entry.tags)
-        size += 1 + len(entry.tags)
-        clock = None if entry.clock == _NO_CLOCK else entry.clock
-        heard.entries.append(ReceivedBatch(entry.origin, entry.sequence, valid, clock))
+        if isinstance(entry, ReceivedBatch):
+            entry.samples = [sample for sample in samples[place : place + count] if sample is not None]
+            place += count
+        size += 1 + count
+        heard.entries.append(entry)
     yield heard
 
 
@@ -438,7 +438,7 @@ def read_fields(data: bytes) -> dict[str, Any]:
         raise MalformedMessageError("text", str(error)) from None
 
 
-def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, list[_Batch | RemovedFrame], int]]:
+def _read_head(kind: Kind, data: bytes) -> Generator[None, None, _Head]:
     _, _, flags, ways, origin_count, authority_count, entry_count, number, bus, *claimed = _HEADER.unpack_from(data)
     if entry_count > MAX_ENTRIES:
         raise MalformedMessageError("oversized", f"a message of {entry_count} entries, more than {MAX_ENTRIES}")
@@ -466,40 +466,41 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, tuple[Heard, li
         # All messages share one string for each authority: it may be long, and each sample keeps it.
         authorities.append(intern(data[at : at + length].decode()))
         at += length
-    entries: list[_Batch | RemovedFrame] = []
+    entries: list[tuple[ReceivedBatch | RemovedFrame, int]] = []
+    tags: list[tuple[str, bool]] = []
+    beliefs: dict[int, Belief] = {}
     # Each entry takes some bytes, so a false count ends the loop with an error before the list grows long.
-    count = 0
     for index in range(entry_count):
         if index % _PART_OF_HEAD == _PART_OF_HEAD - 1:
             yield None
         entry_kind, origin, size, entry_number = _ENTRY.unpack_from(data, at)
         at += _ENTRY.size
         if entry_kind == _REMOVAL and size <= MAX_NAME:
-            entries.append(RemovedFrame(origins[origin][0], entry_number, data[at : at + size].decode()))
+            entries.append((RemovedFrame(origins[origin][0], entry_number, data[at : at + size].decode()), 0))
             at += size
         elif entry_kind in (_BATCH, _UNCERTAIN):
-            count += size
-            if count > MAX_SAMPLES:
+            first = len(tags)
+            if first + size > MAX_SAMPLES:
                 raise MalformedMessageError("oversized", f"a message of more than {MAX_SAMPLES} samples")
-            tags = struct.unpack_from(f"<{size}H", data, at)
+            tags += [(authorities[tag >> 1], bool(tag & 1)) for tag in struct.unpack_from(f"<{size}H", data, at)]
             at += 2 * size
-            named = [(authorities[tag >> 1], bool(tag & 1)) for tag in tags]
+            for place in range(first, first + size) if entry_kind == _UNCERTAIN else ():
+                belief, at = _read_belief(data, at)
+                if belief is not None:
+                    beliefs[place] = belief
+                if len(beliefs) % _BELIEFS_AT_ONCE == _BELIEFS_AT_ONCE - 1:
+                    yield None
             named_origin, clock = origins[origin]
-            beliefs: list[Belief | None] = []
-            if entry_kind == _UNCERTAIN:
-                for k in range(size):
-                    belief, at = _read_belief(data, at)
-                    beliefs.append(belief)
-                    if k % _BELIEFS_AT_ONCE == _BELIEFS_AT_ONCE - 1:
-                        yield None
-            entries.append(_Batch(named_origin, clock, entry_number, named, beliefs))
+            batch = ReceivedBatch(named_origin, entry_number, [], None if clock == _NO_CLOCK else clock)
+            entries.append((batch, size))
         else:
             raise IndexError
     # Slicing past the end raises nothing, so the end is checked.
     if at > len(data) or at > MAX_HEAD:
         raise IndexError
     claim = Claim(since, sequence, digest, bool(flags & _FINAL), bool(flags & _PARTIAL))
-    return Heard(kind, bus, number, claim, time, reach, bool(flags & _SERVES)), entries, at
+    heard = Heard(kind, bus, number, claim, time, reach, bool(flags & _SERVES))
+    return _Head(heard, at, entries, tags, beliefs)
 
 
 def _read_belief(data: bytes, at: int) -> tuple[Belief | None, int]:
@@ -516,9 +517,7 @@ def _read_belief(data: bytes, at: int) -> tuple[Belief | None, int]:
     return belief, at + 1 + _COVARIANCE.size
 
 
-def _with_belief(sample: ReceivedTransform, belief: Belief | None) -> FromLink:
-    if belief is None:
-        return sample
+def _with_belief(sample: FromLink, belief: Belief) -> FromLink:
     found = ReceivedUncertain.__new__(ReceivedUncertain)
     found._fields, found.belief = sample._fields, belief
     return found
