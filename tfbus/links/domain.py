@@ -187,8 +187,8 @@ class DomainEnd(Endpoint):
             self.guarded(answer, sender, self._questions.pop((sender, kind)))
             after = self._now()
             now, self._answers_due = after, 2 * after - now
-        for peer in self._history.overdue():
-            self._end_history(peer)
+        for late in self._history.overdue():
+            self._end_history(self.peers[late])
         due = self._agreement.next_due()
         if now >= due:
             self._ask(now)
@@ -267,7 +267,8 @@ class DomainEnd(Endpoint):
     def _sign(self, now: float) -> None:
         self._signed_at, self._sign_due = now, now + self._sign_period
         self.send()
-        self._channels.sign(self.own, now, self._reach(), self._serves, self.clocks.section(answers=True))
+        serves = self.lookups.server is not None
+        self._channels.sign(self.own, now, self._reach(), serves, self.clocks.section(answers=True))
         self._tell_offsets()
 
     def _reach(self) -> list[Way]:
@@ -278,7 +279,8 @@ class DomainEnd(Endpoint):
         """Send a new peer the entries that this link brings, or an empty meeting if they are too many."""
         self.send()
         claim, clocks = self.own.claim(self._now()), self.clocks.section(answers=False)
-        out = Outgoing(Kind.MEETING, self._bus, 0, claim, self.time, self._reach(), self._serves, clocks)
+        serves = self.lookups.server is not None
+        out = Outgoing(Kind.MEETING, self._bus, 0, claim, self.time, self._reach(), serves, clocks)
         entries = [known.told for known in islice(self.own.brought(self), CHUNK + 1)]
         try:
             message = write_message(out, entries if len(entries) <= CHUNK else ())
@@ -377,7 +379,7 @@ class DomainEnd(Endpoint):
             return
         if kind is Kind.PAST:
             if not self._history.goes_on(peer.id, heard):
-                self._end_history(peer.id)
+                self._end_history(peer)
         elif kind is Kind.ANSWER:
             self._agreement.answered(peer.id, heard.claim, peer.news, now)
         else:
@@ -402,7 +404,6 @@ class DomainEnd(Endpoint):
                 if self._place(peer, source, entry, heard):
                     # The samples before the step are published before those behind it.
                     self._publish(together, heard.kind)
-                    together = []
                     self._begin_anew(peer, source)
                 # The authorities of a bus beyond the peer do not count as the peer's.
                 if entry.origin in peer.paths and not self._admit_authorities(peer, entry.samples):
@@ -414,7 +415,6 @@ class DomainEnd(Endpoint):
                 if heard.kind is not Kind.LIVE:
                     continue
             self._publish(together, heard.kind)
-            together = []
             if self.bus.closed:
                 # A subscriber may have closed it since the last entry.
                 return news
@@ -530,10 +530,12 @@ class DomainEnd(Endpoint):
         return news, admitted
 
     def _publish(self, samples: list[FromLink], kind: Kind) -> None:
+        """Publish some samples, and empty their list."""
         if samples and not self.bus.closed:
             with nullcontext() if kind is Kind.LIVE else self.bus._kept_samples():
                 self.bus.publish(samples, invalid="drop")
             self.samples += len(samples)
+        samples.clear()
 
     def _count_gap(self, peer: Peer, number: int, live: bool) -> bool:
         """Count the live messages that are missing before this number; returns whether there are any."""
@@ -577,7 +579,6 @@ class DomainEnd(Endpoint):
             self._join(link, self._waiting.pop(link))
 
     def _lose(self, peer: Peer) -> tuple[str, ...]:
-        self._end_history(peer.id, peer)
         lost = self._forget(peer)
         frames = self.relay.frames_of(lambda shown: shown.origin in lost)
         self._withdraw(lost)
@@ -589,7 +590,7 @@ class DomainEnd(Endpoint):
 
     def _forget(self, peer: Peer) -> set[bytes]:
         """Forget a peer; returns the buses that are no longer reached."""
-        self._end_history(peer.id)
+        self._end_history(peer)
         self._agreement.left(peer.id)
         self.lookups.left(peer.id)
         self.clocks.left(peer.id)
@@ -663,23 +664,17 @@ class DomainEnd(Endpoint):
         out = Outgoing(Kind.PAST, self._bus, 0, Claim(0, 0, 0, final))
         self._wire.send(sender, write_message(out, entries))
 
-    def _end_history(self, peer: str, lost: Peer | None = None) -> None:
+    def _end_history(self, peer: Peer) -> None:
         """Stop waiting for the past of a peer, and publish its live messages that were held back."""
-        known = lost or self.peers.get(peer)
-        if peer in self._history.open:
-            held = self._history.end(peer)
-            if known is not None:
-                if not self._history.open:
-                    # The newest samples of frames without a past were not published yet.
-                    self._show()
-                for heard in held:
-                    self._take_held(known, heard)
+        if peer.id in self._history.open:
+            held = self._history.end(peer.id)
+            if not self._history.open:
+                # The newest samples of frames without a past were not published yet.
+                self._show()
+            for heard in held:
+                self._take_held(peer, heard)
 
     # Robots
-
-    @property
-    def _serves(self) -> bool:
-        return self.lookups.server is not None
 
     def _view_of(self, robot: str) -> View:
         view = self.views.get(robot)

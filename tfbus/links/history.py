@@ -79,7 +79,6 @@ class _Open:
     due: float = 0.0
     after: str = ""
     held: list[Heard] = field(default_factory=list)
-    size: int = 0
 
 
 class HistoryAsker:
@@ -121,11 +120,10 @@ class HistoryAsker:
         waiting = self.open.get(peer)
         if waiting is None or len(waiting.held) >= MOST_HELD:
             return False
-        size = sum(1 + entry.size for entry in message.entries)
+        size = _size(message)
         if self._size + size > MOST_HELD_SAMPLES:
             return False
         waiting.held.append(message)
-        waiting.size += size
         self._size += size
         return True
 
@@ -148,11 +146,9 @@ class HistoryAsker:
 
     def end(self, peer: str) -> list[Heard]:
         """Stop waiting for the answer of a peer; returns its messages that were held back."""
-        waiting = self.open.pop(peer, None)
-        if waiting is None:
-            return []
-        self._size -= waiting.size
-        return waiting.held
+        held = self.open.pop(peer).held
+        self._size -= sum(map(_size, held))
+        return held
 
     def overdue(self) -> list[str]:
         """The peers whose answers have not come in time."""
@@ -162,3 +158,7 @@ class HistoryAsker:
     def next_due(self) -> float:
         """The time at which `overdue` is to be called next."""
         return min((waiting.due for waiting in self.open.values()), default=inf)
+
+
+def _size(message: Heard) -> int:
+    return sum(1 + entry.size for entry in message.entries)
