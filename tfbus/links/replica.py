@@ -69,17 +69,12 @@ from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from itertools import islice
 from math import inf
 from operator import itemgetter
 from random import uniform
 from typing import Any, ClassVar, NamedTuple, Self
-
-try:
-    # hashlib has it too, but loads OpenSSL for others, which takes 0.6 MB of each process with a link.
-    from _blake2 import blake2b
-except ImportError:  # A Python that has it elsewhere.
-    from hashlib import blake2b
 
 from tfbus.geometry.stamped import TransformStamped, shifted
 from tfbus.geometry.uncertain import UncertainSample, with_belief
