@@ -142,7 +142,7 @@ class Connection:
         self.tail: bytearray = bytearray()
         self.waits: bool = waits
         # The rest of the frame that is written next: nothing goes before it.
-        self._begun = memoryview(b"")
+        self._begun: bytes | memoryview = b""
         self._sent: deque[bytes] = deque()
         self._published: deque[bytes] = deque()
         self._size_sent = self._size_published = 0
@@ -155,50 +155,56 @@ class Connection:
 
     def publish(self, frame: bytes) -> None:
         """Write a frame at once, or have it wait; the oldest that wait are dropped."""
+        if not self.waits:
+            self._begun = frame
+            self.flush()
+            return
         self._published.append(frame)
         self._size_published += len(frame)
-        if not self.waits:
-            self.flush()
         while self._size_published > MOST_PUBLISHED:
             self._size_published -= len(self._published.popleft())
 
     def send(self, frame: bytes) -> bool:
         """Write a frame at once, or have it wait before all that are published; False if there is no room."""
-        if self._size_sent + len(frame) > MOST_SENT:
-            return False
-        self._sent.append(frame)
-        self._size_sent += len(frame)
         if not self.waits:
+            self._begun = frame
             self.flush()
+        elif self._size_sent + len(frame) > MOST_SENT:
+            return False
+        else:
+            self._sent.append(frame)
+            self._size_sent += len(frame)
         return True
 
     def flush(self) -> None:
         """Write the waiting frames, as far as there is room."""
         written, most = 1, MOST_AT_ONCE
-        while written and most > 0 and self._next_frame():
+        while written and most > 0 and (frame := self._begun or self._next_frame()):
             try:
-                written = self.sock.send(self._begun, _FLAGS)
+                written = self.sock.send(frame, _FLAGS)
             except BlockingIOError:
                 written = 0
             except OSError:
                 # The other side reads no more. The reading finds the end, after all that the other has written before.
-                written = len(self._begun)
-            self._begun = self._begun[written:]
+                written = len(frame)
+            self._begun = memoryview(frame)[written:] if written < len(frame) else b""
             most -= written
         waits = bool(self._begun or self._sent or self._published)
         if waits is not self.waits:
             self.waits = waits
             self._watch()
 
-    def _next_frame(self) -> bool:
-        """Have the next frame begun, if none is; returns whether there is one."""
-        if not self._begun and self._sent:
-            self._begun = memoryview(self._sent.popleft())
-            self._size_sent -= len(self._begun)
-        elif not self._begun and self._published:
-            self._begun = memoryview(self._published.popleft())
-            self._size_published -= len(self._begun)
-        return bool(self._begun)
+    def _next_frame(self) -> bytes:
+        """Take the next frame from its queue; empty if none waits."""
+        if self._sent:
+            frame = self._sent.popleft()
+            self._size_sent -= len(frame)
+        elif self._published:
+            frame = self._published.popleft()
+            self._size_published -= len(frame)
+        else:
+            frame = b""
+        return frame
 
     async def drain(self) -> None:
         """Wait until all that waits has been written, instead of the poll."""
