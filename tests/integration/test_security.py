@@ -34,7 +34,7 @@ from tfbus.links.message import Kind, write_body
 from tfbus.links.rmw_zenoh import RmwZenohLink
 from tfbus.links.rosbridge import RosbridgeLink, RosbridgeServer
 from tfbus.links.zenoh import ZenohLink, ZenohRouter, zenoh_router
-from tfbus.links.zenoh.sessions import client_config, open_session
+from tfbus.links.zenoh.sessions import open_session, session_config
 from tfbus.view import View
 
 ROOT = Path(__file__).parents[2]
@@ -192,7 +192,7 @@ async def test_a_guest_that_may_not_publish_cannot_speak_for_another_link(tmp_pa
             TransformBroadcaster(bus).send_static("base_link", "laser", Transform())
             await until(lambda: "laser" in buffer.tree.frames())
             for address in (at_guests, at_friends):
-                session = open_session(client_config(address, None, None))
+                session = open_session(session_config(None, address, None, None))
                 session.put(f"tfbus/{domain}/@to/{robot.id}", b"noise", attachment=bytes.fromhex(friend.id))
                 session.close()
             await until(lambda: robot.statistics().rejected != {})

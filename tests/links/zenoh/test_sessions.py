@@ -18,10 +18,9 @@ from tfbus.links.zenoh.sessions import (
     LEASE,
     SIGNS_OF_LIFE,
     Addresses,
-    client_config,
     endpoints,
     open_session,
-    router_config,
+    session_config,
 )
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
 
@@ -55,17 +54,17 @@ def test_an_error_names_a_malformed_address(address: str) -> None:
         with pytest.raises(ValueError, match=f"not {address!r}"):
             endpoints(addresses)
         with pytest.raises(ValueError, match=f"not {address!r}"):
-            router_config(addresses, (), None, None)
+            session_config(addresses, (), None, None)
         with pytest.raises(ValueError, match=f"not {address!r}"):
-            client_config(addresses, None, None)
+            session_config(None, addresses, None, None)
 
 
 @pytest.mark.parametrize("address", ["tcp/host:7447#", "tcp/host:7447?", "tcp/host:7447?#"])
 def test_an_address_that_zenoh_alone_finds_malformed_is_refused_at_once(address: str) -> None:
     with pytest.raises(ValueError, match="zenoh does not take") as client:
-        client_config([ROUTER, address], None, None)
+        session_config(None, [ROUTER, address], None, None)
     with pytest.raises(ValueError, match="zenoh does not take") as router:
-        router_config(ROUTER, address, None, None)
+        session_config(ROUTER, address, None, None)
     assert address in str(client.value)
     assert address in str(router.value)
 
@@ -98,27 +97,29 @@ async def test_an_address_at_which_zenoh_panics_is_passed_over(
     ],
 )
 def test_addresses_of_all_kinds_go_through(address: str) -> None:
-    config = router_config(address, address, None, None)
+    config = session_config(address, address, None, None)
     assert read(config, "listen/endpoints") == read(config, "connect/endpoints") == [address]
 
 
 def test_each_end_announces_its_lease_and_says_more_often_that_it_lives() -> None:
     for config, lease in (
-        (client_config(ROUTER, None, None), LEASE),
-        (router_config("tcp/127.0.0.1:0", (), None, 1.5), 1.5),
+        (session_config(None, ROUTER, None, None), LEASE),
+        (session_config("tcp/127.0.0.1:0", (), None, 1.5), 1.5),
     ):
         assert read(config, "transport/link/tx/lease") == lease * 1_000
         assert read(config, "transport/link/tx/keep_alive") == SIGNS_OF_LIFE
 
 
 def test_settings_of_zenoh_win_over_those_of_the_link() -> None:
-    config = client_config(ROUTER, {"transport/link/tx/lease": 7_000, "transport/link/tx/queue/size/data": 4}, 2.0)
+    config = session_config(
+        None, ROUTER, {"transport/link/tx/lease": 7_000, "transport/link/tx/queue/size/data": 4}, 2.0
+    )
     assert read(config, "transport/link/tx/lease") == 7_000
     assert read(config, "transport/link/tx/queue/size/data") == 4
 
 
 def test_nobody_is_looked_for_and_no_message_is_assembled_that_no_link_takes() -> None:
-    for config in (client_config(ROUTER, None, None), router_config("tcp/127.0.0.1:0", (), None, None)):
+    for config in (session_config(None, ROUTER, None, None), session_config("tcp/127.0.0.1:0", (), None, None)):
         assert read(config, "scouting/multicast/enabled") is False
         assert MAX_MESSAGE < read(config, "transport/link/rx/max_message_size") < 2 * MAX_MESSAGE
 
@@ -126,7 +127,7 @@ def test_nobody_is_looked_for_and_no_message_is_assembled_that_no_link_takes() -
 @pytest.mark.parametrize("lease", [0.0, -1.0, math.nan, math.inf])
 def test_a_lease_is_a_time_that_passes(lease: float) -> None:
     with pytest.raises(ValueError, match="lease"):
-        client_config(ROUTER, None, lease)
+        session_config(None, ROUTER, None, lease)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +136,7 @@ def test_a_lease_is_a_time_that_passes(lease: float) -> None:
 )
 def test_a_setting_that_zenoh_does_not_take_is_named_with_its_value(path: str, value: object) -> None:
     with pytest.raises(ValueError, match="zenoh does not take") as caught:
-        client_config(ROUTER, {path: value}, None)
+        session_config(None, ROUTER, {path: value}, None)
     assert repr(path) in str(caught.value)
     assert repr(value) in str(caught.value)
     assert ".rs:" not in str(caught.value)
@@ -143,18 +144,18 @@ def test_a_setting_that_zenoh_does_not_take_is_named_with_its_value(path: str, v
 
 def test_a_setting_that_is_not_json_is_named() -> None:
     with pytest.raises(ValueError, match="'metadata'"):
-        client_config(ROUTER, {"metadata": object()}, None)
+        session_config(None, ROUTER, {"metadata": object()}, None)
 
 
 @pytest.mark.parametrize("path", ["id", "mode", "listen", "listen/endpoints", "connect", "connect/endpoints/client"])
 def test_who_a_session_is_and_where_it_goes_are_no_settings(path: str) -> None:
     with pytest.raises(ValueError, match=f"{path!r} is not for config: give addresses by connect and listen"):
-        client_config(ROUTER, {path: "x"}, None)
+        session_config(None, ROUTER, {path: "x"}, None)
 
 
 def test_a_port_in_use_is_an_os_error_with_its_number() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        config = router_config(f"tcp/127.0.0.1:{server.getsockname()[1]}", (), None, None)
+        config = session_config(f"tcp/127.0.0.1:{server.getsockname()[1]}", (), None, None)
         with pytest.raises(OSError, match="zenoh cannot open a session") as caught:
             open_session(config)
     assert caught.value.errno == errno.EADDRINUSE
@@ -163,13 +164,13 @@ def test_a_port_in_use_is_an_os_error_with_its_number() -> None:
 
 def test_an_os_error_that_only_zenoh_has_found_has_no_number() -> None:
     with pytest.raises(OSError, match="private key") as caught:
-        open_session(router_config("tls/127.0.0.1:0", (), None, None))
+        open_session(session_config("tls/127.0.0.1:0", (), None, None))
     assert caught.value.errno is None
 
 
 def test_a_router_that_is_not_there_is_an_os_error() -> None:
     with pytest.raises(OSError, match="zenoh cannot open a session"):
-        open_session(client_config(free_address(), None, None))
+        open_session(session_config(None, free_address(), None, None))
 
 
 # TLS and access control

@@ -16,7 +16,7 @@ from support.wires import LIVE, Ear, met
 from support.zenoh_wires import listening, start_router, talk
 
 from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left
-from tfbus.links.zenoh.sessions import client_config, open_session
+from tfbus.links.zenoh.sessions import open_session, session_config
 from tfbus.links.zenoh.wire import ZenohWire
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
 from tfbus.tf_message import MalformedMessageError
@@ -338,7 +338,7 @@ async def test_a_link_closes_while_its_router_is_stopped(address: str, domain: s
 @asynccontextmanager
 async def stranger(address: str, ear: Ear) -> AsyncIterator[zenoh.Session]:
     """A session of zenoh that says what it likes, once the router knows what a link hears."""
-    with open_session(client_config(address, None, None)) as session:
+    with open_session(session_config(None, address, None, None)) as session:
         # The token is the last thing that the link declares.
         token = session.liveliness().declare_subscriber(f"tfbus/**/@alive/{ear.id}/*", history=True)
         await anyio.to_thread.run_sync(token.recv)

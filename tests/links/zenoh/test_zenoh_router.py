@@ -12,7 +12,7 @@ from support.zenoh_wires import listening, start_router, talk, way_to
 from tfbus.links.seams import Joined, Left
 from tfbus.links.zenoh import wire
 from tfbus.links.zenoh.neighbours import Neighbours
-from tfbus.links.zenoh.sessions import router_config
+from tfbus.links.zenoh.sessions import session_config
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
 
 pytestmark = pytest.mark.anyio
@@ -170,7 +170,7 @@ async def test_a_router_keeps_to_the_rules_of_a_file(address: str, domain: str, 
 def test_a_file_of_settings_wins_over_those_of_the_router_but_for_addresses(tmp_path: Path) -> None:
     file = tmp_path / "settings.json5"
     file.write_text("{transport: {link: {tx: {lease: 7000}}}}", encoding="utf-8")
-    config = router_config("tcp/127.0.0.1:0", (), str(file), 2.0)
+    config = session_config("tcp/127.0.0.1:0", (), str(file), 2.0)
     assert config.get_json("transport/link/tx/lease") == "7000"
     assert config.get_json("scouting/multicast/enabled") == "false"
     for text, problem in (

@@ -50,36 +50,17 @@ _NOT_TO_SET = re.compile("id|mode|listen|listen/endpoints.*|connect|connect/endp
 _NOT_IN_FILE = "id", "mode", "listen", "connect"
 
 
-def router_config(listen: Addresses, connect: Addresses, config: Settings | None, lease: float | None) -> zenoh.Config:
-    """The settings of a router, which keeps trying to reach all other routers in `connect`; raises as `client_config`.
+def session_config(
+    listen: Addresses | None, connect: Addresses, config: Settings | None, lease: float | None
+) -> zenoh.Config:
+    """The settings of a router, which keeps trying to reach all other routers, or of a client of any of some routers.
 
     Parameters
     ----------
-    listen, connect : str or iterable of str
-        zenoh's endpoints, such as ``tcp/192.168.1.5:7447``.
-    config, lease
-        As for `client_config`.
-    """
-    values = {
-        "mode": "router",
-        "listen/endpoints": endpoints(listen),
-        "connect/endpoints": endpoints(connect),
-        "connect/timeout_ms": -1,
-        "connect/exit_on_failure": False,
-        # It would wait so long for routers that scouting finds.
-        "scouting/delay": 0,
-        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1_000, "period_increase_factor": 2},
-    }
-    return _config(values, config, lease)
-
-
-def client_config(connect: Addresses, config: Settings | None, lease: float | None) -> zenoh.Config:
-    """The settings of a client of any of some routers.
-
-    Parameters
-    ----------
+    listen : str or iterable of str, or None
+        zenoh's endpoints, such as ``tcp/192.168.1.5:7447``, at which a router listens; None for a client.
     connect : str or iterable of str
-        zenoh's endpoints, such as ``tcp/192.168.1.5:7447``.
+        The endpoints of other routers.
     config : mapping of str to any, or str or path, or None
         zenoh's own settings by their path, such as ``transport/link/tls/root_ca_certificate``, or the name of a file
         of such settings; they override all others.
@@ -96,15 +77,11 @@ def client_config(connect: Addresses, config: Settings | None, lease: float | No
     OSError
         If the file cannot be read.
     """
-    values = {"mode": "client", "connect/endpoints": endpoints(connect), "connect/timeout_ms": 0}
-    return _config(values, config, lease)
-
-
-def _config(values: dict[str, Any], config: Settings | None, lease: float | None) -> zenoh.Config:
     silence = LEASE if lease is None else as_duration(lease, "lease")
     if not 0 < silence < math.inf:
         raise ValueError(f"lease must be a time that passes, got {lease}")
-    values |= {
+    values: dict[str, Any] = {
+        "connect/endpoints": endpoints(connect),
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/unicast/open_timeout": round(OPENING_TIME * 1_000),
@@ -116,6 +93,18 @@ def _config(values: dict[str, Any], config: Settings | None, lease: float | None
         # Larger messages are not even assembled; zenoh adds a key and some headers to each.
         "transport/link/rx/max_message_size": MAX_MESSAGE + 2**17,
     }
+    if listen is None:
+        values |= {"mode": "client", "connect/timeout_ms": 0}
+    else:
+        values |= {
+            "mode": "router",
+            "listen/endpoints": endpoints(listen),
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+            # It would wait so long for routers that scouting finds.
+            "scouting/delay": 0,
+            "connect/retry": {"period_init_ms": 200, "period_max_ms": 1_000, "period_increase_factor": 2},
+        }
     result = zenoh.Config()
     if isinstance(config, str | os.PathLike):
         default, result = result, _read_settings(config)

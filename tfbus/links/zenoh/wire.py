@@ -56,12 +56,11 @@ from tfbus.links.zenoh.sessions import (
     Addresses,
     Settings,
     begin_to_close,
-    client_config,
     close_session,
     endpoints,
     open_session,
     os_error,
-    router_config,
+    session_config,
     use_zenoh,
     wait_until_closed,
 )
@@ -129,16 +128,13 @@ class ZenohWire(Wire):
         self.own: str = f"{self.domain}/{robot or NO_ROBOT}"
         self._addresses = deque(endpoints(connect or ()))
         self._is_router = listen is not None
-        if listen is not None:
-            self._config = router_config(listen, self._addresses, config, lease)
-        elif self._addresses:
-            self._config = client_config(self._addresses, config, lease)
-        else:
+        if listen is None and not self._addresses:
             raise ValueError(
                 "a link over zenoh needs a router: connect='tcp/host:7447' is the address of one, and "
                 "listen='tcp/0.0.0.0:7447' makes this process one; the processes of one machine need none, and meet by "
                 "the local link"
             )
+        self._config = session_config(listen, self._addresses, config, lease)
         self._session: _Session | None = None
         self._sessions = 0
         self._failure: OSError | None = None
