@@ -586,8 +586,8 @@ def open_recording(
     size, or 64 MiB if that is more, in a nameless temporary file. An index of more than 64 MiB is not used. The
     descriptions of all channels and types take at most 64 MiB. All compressed chunks together unfold to at most 1,000
     times the size of the file, or 1 GiB if that is more; later chunks are left out. Messages of chunks that overlap in
-    time are sorted in memory up to 512 MiB. A trajectory has at most 5 million poses, and 4,096 bytes a line. So
-    reading a hostile file takes at most 2 GiB of memory.
+    time are sorted in memory up to 512 MiB; 10,000 covariances wait for their transforms. A trajectory has at most 5
+    million poses, and 4,096 bytes a line. So reading a hostile file takes at most 2 GiB of memory.
 
     If a writer has left a journal beside an SQLite file, the file is copied to a temporary folder, where SQLite undoes
     the last transaction. If the writer still runs, the original is read.
