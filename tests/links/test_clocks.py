@@ -1,5 +1,6 @@
 """The clocks of peers: they are measured within their bounds, told, and corrected once, whatever the network does."""
 
+import pickle
 import random
 from itertools import pairwise
 
@@ -14,6 +15,7 @@ from tfbus import (
     Buffer,
     Bus,
     ClockOffset,
+    FutureExtrapolationError,
     LocalLink,
     PeerClock,
     PeerClockStepped,
@@ -285,21 +287,25 @@ def test_a_clock_that_is_set_is_noticed_at_once_and_nothing_is_interpolated_acro
             assert x == pytest.approx(at / SECOND - ahead, abs=0.001)
 
 
-@pytest.mark.parametrize("corrects", [False, True])
-def test_explanations_and_errors_name_the_clock_that_differs(corrects: bool) -> None:
+@pytest.mark.parametrize(("corrects", "ahead"), [(False, 0.31), (True, 0.31), (False, -0.31)])
+def test_explanations_and_errors_name_the_clock_that_differs(corrects: bool, ahead: float) -> None:
     world = World()
     network = Network(world)
     network.delay = lambda *_: 0.0004
-    clock = SkewedClock(world, 0.31)
+    clock = SkewedClock(world, ahead)
     here = world.process(network, clock=SkewedClock(world), corrects=corrects)
     there = world.process(network, clock=clock)
     with Buffer(here.bus) as buffer:
         go(world, 5.0, 0.1, (there, "cart", clock))
-        clear = buffer.explain("map", "cart").edges[0].clock
-        missing = buffer.explain("map", "cart", round((world.now + 1.0) * SECOND)).errors
+        clear, at = buffer.explain("map", "cart").edges[0].clock, round((world.now + 1.0) * SECOND)
+        missing: list[Exception] = list(buffer.explain("map", "cart", at).errors)
+        for tolerance in (0.0, 0.1):
+            with pytest.raises(FutureExtrapolationError) as refused:
+                buffer.lookup_nowait("map", "cart", at, tolerance=tolerance)
+            missing += [refused.value, pickle.loads(pickle.dumps(refused.value))]
     stamped = f", and stamped {format_stamp(there.frames['cart'].stamp)}" if corrects else ""
-    assert clear == f"its clock runs 310 ms ahead of this one{stamped}"
-    assert [str(error).endswith(clear) for error in missing] == [True]
+    assert clear == f"its clock runs 310 ms {'ahead of' if ahead > 0 else 'behind'} this one{stamped}"
+    assert [str(error).endswith(clear) for error in missing] == [True] * 5
     assert str(buffer.explain("map", "cart")).endswith(clear)
     assert here.bus.statistics().frames == 1
 

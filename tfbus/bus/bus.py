@@ -247,8 +247,8 @@ class Bus:
         self._removals = 0
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
         self._relay: object = None
-        # Links know the clock that stamps a frame; they tell it in words.
-        self._clock_of: Callable[[str], str] = lambda _: ""
+        # Links know the clock that stamps a frame; they name it in words.
+        self._clock_namers: list[Callable[[str], str]] = []
         # Links, recorders and the like; a child made by `fork` has them no more.
         self._entered = self._owner.entered
         self._jumps = self.clock.on_jump(self._clock_jumped)

@@ -426,7 +426,7 @@ def relay_of(bus: Bus) -> Relay:
     """The relay of a bus, which its links share; the bus itself holds it."""
     if not isinstance(bus._relay, Relay):
         relay = bus._relay = Relay(bus)
-        bus._clock_of = relay.clock_of
+        bus._clock_namers.append(relay.clock_of)
     return bus._relay
 
 

@@ -237,7 +237,7 @@ class TransformTree:
     @property
     def inserted(self) -> int:
         """Number of samples at a new stamp."""
-        return self._forest.inserted
+        return self._forest.paths.inserted
 
     @property
     def replaced(self) -> int:

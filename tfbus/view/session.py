@@ -712,7 +712,7 @@ class Session:
     def _frames(self, at: int | Latest, then: int, with_texts: bool) -> Iterator[Message]:
         """The frames if they are others, their states if those have changed, and the poses."""
         fixed = self._fixed
-        asked = forest_of(self._tree).version, fixed, at
+        asked = forest_of(self._tree).paths.version, fixed, at
         if asked != self._asked:
             self._asked, self._poses = asked, None
             if fixed is not None:

@@ -42,7 +42,7 @@ WRITERS_TIME = 1.5
 GREETING_TIME = 0.5
 """s; for so long there is a second reader, which new writers greet."""
 _READING = Lock()
-"""The library converts settings by memory that all threads share, and two threads would free it twice."""
+"""The library reads the settings of others by memory that all threads share, and two threads would free it twice."""
 _PERIOD = 0.002
 _MOST = 10_000
 _LONGEST_NAME = 256
@@ -87,6 +87,18 @@ def read(reader: BuiltinDataReader) -> list[Any]:
         # A stranger has called a participant so. The library reads all of them or none.
         return []
     return [each for each in found if not isinstance(each, InvalidSample)]
+
+
+def publication(reader: DataReader[Any], handle: int) -> Any:
+    """All that the library tells of a writer that a reader is matched with; None if it has gone since.
+
+    Raises
+    ------
+    UnicodeDecodeError
+        If a name of it is no text.
+    """
+    with _READING:
+        return reader.get_matched_publication_data(handle)
 
 
 def name_of(participant: Any) -> str:
