@@ -40,7 +40,7 @@ _STAMP_END = 2**32 * SECOND
 class FoxgloveServer(BusServer):
     """Sends everything that a bus publishes to the Foxglove application: ``async with FoxgloveServer(bus) as server``.
 
-    The transforms are messages of the type ``foxglove.FrameTransforms``; who subscribes later gets the static ones at
+    The transforms are messages of the type ``foxglove.FrameTransforms``; a later subscriber gets the static ones at
     once. While nobody has subscribed, nothing is converted. A slow application loses its oldest messages, a thousand
     behind the newest.
 
@@ -151,7 +151,7 @@ class FoxgloveServer(BusServer):
             return
 
     def _follow_subscriptions(self) -> None:
-        """Listen to the bus while somebody has subscribed, and send the static frames to who has not got them yet."""
+        """Listen to the bus while somebody has subscribed, and send the static frames to new subscribers."""
         if self._server is None:
             return
         subscribers = self._listener.subscribers
