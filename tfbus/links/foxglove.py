@@ -1,7 +1,7 @@
 """`FoxgloveServer`, which shows a bus to the Foxglove application.
 
-The library answers any web page. So it listens at an address of the loopback that no page can guess, and what comes to
-the address of the server goes through a `WebDoor` first.
+The library answers any web page. So it listens at an address of the loopback that no page can guess, and
+connections to the address of the server go through a `WebDoor` first.
 """
 
 import secrets

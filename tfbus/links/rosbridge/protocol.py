@@ -332,7 +332,7 @@ class _Cbor:
             yield name
 
     def _head(self) -> int:
-        """The length of what comes next (RFC 8949, section 3)."""
+        """The length of the next item (RFC 8949, section 3)."""
         info = self._data[self._at] & 31
         self._at += 1
         if info < 24:

@@ -365,7 +365,7 @@ class _Page:
             self._stop(topic)
 
     def _follow(self, topic: str) -> None:
-        """Begin to send a topic as all its subscriptions together want it, with all that is latched."""
+        """Begin to send a topic as all its subscriptions together want it, latched samples first."""
         if topic == _FEEDBACK:
             self._hears_feedback.set()
         elif topic in _TOPICS:
