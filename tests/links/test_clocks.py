@@ -202,6 +202,16 @@ def test_an_offset_is_told_again_when_it_changes_and_when_it_is_over() -> None:
     assert clock_of(there, here).offset == pytest.approx(0.0, abs=0.003)
 
 
+def test_an_offset_that_grows_while_nobody_sends_is_told() -> None:
+    world = World()
+    network = Network(world)
+    here = world.process(network, clock=SkewedClock(world))
+    world.process(network, clock=SkewedClock(world, drift=500e-6))
+    with here.bus.events() as events:
+        world.run(60.0)
+        assert [event.over for event in iter(events.queue.get, None) if isinstance(event, ClockOffset)] == [False]
+
+
 def test_a_bus_with_a_simulated_clock_is_told_as_one_and_not_measured() -> None:
     world = World()
     network = Network(world)

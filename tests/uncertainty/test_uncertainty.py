@@ -233,7 +233,7 @@ def test_close_stamps_between_the_same_samples_differ_little_even_if_the_samples
 
     def spread(a: int, b: int) -> float:
         pair = [tree.lookup("map", "marker", at, covariance=True) for at in (a, b)]
-        return float(joint(pair).difference(0, 1)[0, 0])
+        return float(joint([*pair, *pair]).difference(1, 2)[0, 0])
 
     # (s' - s) (S0 + S1) within a segment; two independent ones at samples, or across whole segments.
     assert [spread(0, 0), spread(500, 501), spread(0, 1000), spread(0, 2000)] == pytest.approx([0.0, 0.002, 2.0, 2.0])
@@ -241,12 +241,14 @@ def test_close_stamps_between_the_same_samples_differ_little_even_if_the_samples
     assert spread(500, 1500) == pytest.approx(1.5)
 
 
-def test_a_sender_that_becomes_surer_gives_no_negative_variance() -> None:
+@pytest.mark.parametrize(("xyz", "rpy"), [(1.0, 0.1), (1e5, 1e-6)])
+def test_a_sender_that_becomes_surer_gives_no_negative_variance(xyz: float, rpy: float) -> None:
     rng = np.random.default_rng(9)
+    surer = np.diag([0.0, xyz, 0.0, rpy, 0.0, 0.0]) ** 2
     for kind in ("independent", "drift", "constant"):
         tree = TransformTree(keep=None)
         for stamp in range(12):
-            error = Covariance(random_covariance(rng, 1.0, 0.1) if stamp % 5 else np.diag([0.0, 1, 0, 0.1, 0, 0]))
+            error = Covariance(random_covariance(rng, xyz, rpy) if stamp % 5 else surer)
             tree.insert(UncertainSample("a", "b", 10 * stamp, random_transform(rng), covariance=error, kind=kind))
         answers = [tree.lookup("a", "b", at, covariance=True) for at in range(0, 110, 3)]
         assert is_positive(joint(answers).covariance)

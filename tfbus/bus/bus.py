@@ -225,7 +225,7 @@ class Bus:
         self._trees: dict[LiveTree, tuple[int, int] | None] = {}
         self._late: dict[LiveTree, LateBuffer] = {}
         self._streams: list[Stream] = []
-        # Everybody but the buffers: some containers, each with the function that gives a batch to all that is in it.
+        # The listeners beside the buffers, by kind, each with the function that gives them a batch.
         self._listeners: tuple[tuple[Sized, Callable[[Batch], object]], ...] = (
             (self._streams, self._put_into_streams),
             (self._events, self._note_in_events),

@@ -471,7 +471,7 @@ T = TypeVar("T")
 
 
 class StaticFrames:
-    """The static edges of a bus, of which none is in a loop. All forests that begin with them share their histories.
+    """The static edges of a bus, without a loop. All forests that begin with them share their histories.
 
     Attributes
     ----------

@@ -2,8 +2,8 @@
 
 As soon as a participant of Fast DDS hears of another one, it tells of its writers, and as soon as it hears of a reader,
 it sends what is latched. Cyclone DDS drops both while it does not know their sender, and Fast DDS repeats them only
-with its next heartbeat, after 3 s. So in `join`, a participant without readers makes itself heard first. When those who
-answer are known, a second one joins, to which all is told once more; and it gets its readers when it knows the writers.
+with its next heartbeat, after 3 s. So in `join`, a participant without readers makes itself heard first. When it knows
+the others, a second one joins, which all tell once more of themselves; it gets its readers when it knows the writers.
 The writers of a program that comes later meet readers which are there already: `Greeting` is for these.
 
 `ReaderThread` waits for all readers in one thread, without listeners. The library calls a listener while it keeps its
@@ -118,7 +118,7 @@ class Greeting:
 
     A writer greets a new reader: its heartbeat tells where its messages begin. Fast DDS does so once, as soon as it has
     heard of the reader, and Cyclone DDS often does not know the writer by then. Then the next heartbeat counts as the
-    greeting, and what came before it is dropped unless it is whole; Fast DDS sends that heartbeat between the parts of
+    greeting, and earlier messages are dropped unless they are whole; Fast DDS sends that heartbeat between the parts of
     the first large message. A second reader has the writer greet once more, and that counts for all readers of the
     participant.
 
