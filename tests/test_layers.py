@@ -131,7 +131,7 @@ def allowed_rooms(room: str) -> set[str]:
 
 
 def parsed(module: str) -> ast.Module:
-    """The tree of a module. Nobody keeps it: the garbage collector would walk through a million nodes in later tests."""
+    """The tree of a module, which nobody keeps: a million nodes would be in the way of the garbage collector."""
     return ast.parse(SOURCES[module].read_text(encoding="utf-8"))
 
 
