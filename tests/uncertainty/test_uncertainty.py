@@ -153,17 +153,15 @@ STEPS, WORLDS, LOOKED_AT = 300, 3000, {100, 200, 290, 299, 300}
 def driven(kind: Kind) -> tuple[TransformTree, dict[int, Matrix]]:
     """A tree of a robot whose errors are of a kind; and in many worlds, the truth at some steps, shape (n, 4, 4)."""
     rng, tree = np.random.default_rng(7), TransformTree(keep=None)
-    believed, matrix, true, truth = Transform(), np.zeros((6, 6)), np.tile(np.eye(4), (WORLDS, 1, 1)), {}
+    believed, matrix = Transform(), np.zeros((6, 6)) if kind == "drift" else FIX
+    true, truth = np.tile(np.eye(4), (WORLDS, 1, 1)), {}
     constant = white(rng, WORLDS, 6) @ root(FIX).T
     for step in range(STEPS + 1):
-        if kind == "independent":
-            matrix, true = FIX, disturbed(believed, rng.standard_normal((WORLDS, 6)) @ root(FIX).T)
-        elif kind == "constant":
-            matrix, true = FIX, disturbed(believed, constant)
-        elif step:
+        if kind == "drift" and step:
             true = true @ disturbed(AHEAD, rng.standard_normal((WORLDS, 6)) @ root(SLIP).T)
         if step in LOOKED_AT:
-            truth[step] = true
+            error = constant if kind == "constant" else rng.standard_normal((WORLDS, 6)) @ root(FIX).T
+            truth[step] = true if kind == "drift" else disturbed(believed, error)
         sample = UncertainSample("odom", "base", step * STEP, believed, covariance=Covariance(matrix), kind=kind)
         tree.insert(sample)
         if kind == "drift":
