@@ -656,6 +656,7 @@ def test_trees_and_buses_are_as_their_models_say_on_the_python_kernel_too() -> N
     assert done.returncode == 0, done.stdout
 
 
+CHOOSE = "from tfbus import kernel"
 WITHOUT = "import sys; sys.modules['tfbus._kernel'] = None\n"
 
 
@@ -711,8 +712,8 @@ os.environ["TFBUS_KERNEL"] = ""
 @pytest.mark.parametrize(
     ("wanted", "script", "error"),
     [
-        ("rust", SHOW, "ValueError: TFBUS_KERNEL must be 'python' or 'compiled', not 'rust'"),
-        ("compiled", WITHOUT + SHOW, "tfbus._kernel halted"),
+        ("rust", CHOOSE, "ValueError: TFBUS_KERNEL must be 'python' or 'compiled', not 'rust'"),
+        ("compiled", WITHOUT + CHOOSE, "tfbus._kernel halted"),
     ],
 )
 def test_a_kernel_that_is_not_there_is_an_error_that_names_it(wanted: str, script: str, error: str) -> None:
