@@ -229,6 +229,16 @@ async def test_a_set_comes_with_its_transforms_or_is_dropped_and_a_cancelled_rea
         assert clock.now() == from_seconds(102)
 
 
+async def test_it_is_entered_once_before_it_is_read() -> None:
+    sets = Synchronizer(replay([]), replay([]), within=1.0)
+    with pytest.raises(RuntimeError, match="enter the synchronizer first: async with"):
+        await anext(sets)
+    async with sets:
+        pass
+    with pytest.raises(RuntimeError, match="entered once: make another one"):
+        await sets.__aenter__()
+
+
 async def test_arguments_that_do_not_fit_the_streams_are_refused() -> None:
     one, two = replay([]), replay([])
     with pytest.raises(ValueError, match="at least two streams, got 1"):

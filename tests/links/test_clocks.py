@@ -151,8 +151,9 @@ def go(world: World, seconds: float, period: float, *sends: tuple[Process, str, 
         world.run(period)
 
 
-@pytest.mark.parametrize("ahead", [0.02, -0.02, 0.3, -0.3, 3600.0])
-@pytest.mark.parametrize("drift", [0.0, 100e-6])
+@pytest.mark.parametrize(
+    ("ahead", "drift"), [(0.02, 0.0), (-0.02, 100e-6), (0.3, 100e-6), (-0.3, 0.0), (3600.0, 100e-6)]
+)
 def test_the_offset_of_a_peer_and_its_drift_are_told_within_seconds(ahead: float, drift: float) -> None:
     world = World()
     network = Network(world)
@@ -277,7 +278,7 @@ def test_a_clock_that_is_set_is_noticed_at_once_and_nothing_is_interpolated_acro
     there, third = world.process(network, clock=clock), world.process(network, clock=other)
     sends = (there, "cart", clock), (third, "tool", other)
     with Buffer(here.bus) as buffer, here.bus.events() as events:
-        go(world, 5.0, 0.01, *sends)
+        go(world, 5.0, 0.1, *sends)
         before = clock.now()
         clock.ahead += step
         publish(there, "cart", clock)
@@ -341,11 +342,11 @@ def test_a_correction_moves_smoothly_and_stays_in_order() -> None:
     clock = SkewedClock(world, 0.3, 50e-6)
     here = world.process(network, clock=SkewedClock(world), corrects=True)
     there = world.process(network, clock=clock)
-    go(world, 10.0, 0.01, (there, "cart", clock))
+    go(world, 10.0, 0.1, (there, "cart", clock))
     here.seen.clear()
-    go(world, 60.0, 0.01, (there, "cart", clock))
+    go(world, 20.0, 0.01, (there, "cart", clock))
     steps = [later.stamp - earlier.stamp for earlier, later in pairwise(here.seen)]
-    assert len(steps) > 5_000
+    assert len(steps) > 1_500
     assert max(abs(step - SECOND // 100) for step in steps) < 100_000
 
 

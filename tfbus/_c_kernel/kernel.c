@@ -100,6 +100,12 @@ module_exec(PyObject *module)
         || add_type(module, "Method", &method_spec, &MethodType) < 0) {
         return -1;
     }
+#ifdef KERNEL_SOURCES
+    /* In a checkout, tfbus/running_kernel.py compares it with the checksum of these files. */
+    if (PyModule_AddIntConstant(module, "sources", KERNEL_SOURCES) < 0) {
+        return -1;
+    }
+#endif
     return 0;
 }
 

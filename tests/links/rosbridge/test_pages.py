@@ -317,6 +317,10 @@ REFUSED: dict[str, tuple[str | bytes | dict[str, Any], str]] = {
     "a huge number": ({"op": "subscribe", "topic": "/tf", "queue_length": 10**400}, "must be a number"),
     "publishing": ({"op": "publish", "topic": "/tf", "msg": {"transforms": []}}, "without publish=True"),
     "advertising": ({"op": "advertise", "topic": "tf_static"}, "without publish=True"),
+    "publishing elsewhere": (
+        {"op": "publish", "topic": "/odom", "msg": {}},
+        "nobody hears the topic '/odom'; there are",
+    ),
     "a level": ({"op": "set_level", "level": "loud"}, "not 'loud'"),
     "a goal": ({"op": "publish", "topic": "/tf2_web_republisher/goal", "msg": {"goal_id": {"id": "g"}}}, "goal must"),
     "frames": (
