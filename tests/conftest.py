@@ -107,10 +107,14 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Spare the garbage collector all that is imported and collected: it would walk through it again in every test."""
+    """Spare the garbage collector all that is imported and collected: it would walk through it again in every test.
+
+    It also comes more seldom, and so does not walk through the same samples of a test again and again.
+    """
     gc.disable()
     done = yield
     gc.freeze()
+    gc.set_threshold(20_000, 10, 10)
     gc.enable()
     return done
 

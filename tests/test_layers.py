@@ -130,8 +130,8 @@ def allowed_rooms(room: str) -> set[str]:
     return allowed
 
 
-@cache
 def parsed(module: str) -> ast.Module:
+    """The tree of a module, which nobody keeps: a million nodes would be in the way of the garbage collector."""
     return ast.parse(SOURCES[module].read_text(encoding="utf-8"))
 
 

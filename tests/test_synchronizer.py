@@ -205,7 +205,7 @@ async def test_a_set_comes_with_its_transforms_or_is_dropped_and_a_cancelled_rea
         for second in seconds:
             yield PointStamped(frame, from_seconds(second), (0.0, 0.0, 0.0))
 
-    clock = SimulatedClock(start=0)
+    clock = SimulatedClock(start=from_seconds(100))
     with Bus(clock) as bus, Buffer(bus) as buffer:
         robot = TransformBroadcaster(bus)
         robot.send_static("base", "camera", Transform((1.0, 0.0, 0.0)))
@@ -225,6 +225,18 @@ async def test_a_set_comes_with_its_transforms_or_is_dropped_and_a_cancelled_rea
 
             await simulate(clock, read_on)
         assert [dict(counts) for counts in sets.dropped] == [{"no transform": 2}] * 2
+        # Each of the two sets has waited for a second.
+        assert clock.now() == from_seconds(102)
+
+
+async def test_it_is_entered_once_before_it_is_read() -> None:
+    sets = Synchronizer(replay([]), replay([]), within=1.0)
+    with pytest.raises(RuntimeError, match="enter the synchronizer first: async with"):
+        await anext(sets)
+    async with sets:
+        pass
+    with pytest.raises(RuntimeError, match="entered once: make another one"):
+        await sets.__aenter__()
 
 
 async def test_arguments_that_do_not_fit_the_streams_are_refused() -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +49,15 @@ def compile_kernel(folder: Path) -> None:
     """Compile the kernel into a folder."""
     from setuptools import Distribution, Extension  # type: ignore[import-untyped, unused-ignore]
 
+    # The check of `tfbus.running_kernel` in a checkout.
+    checksum = 0
+    for path in sorted((PACKAGE / "_c_kernel").glob("*.[ch]")):
+        checksum = zlib.crc32(path.read_bytes(), checksum)
     flags = ["/O2", "/fp:precise"] if sys.platform == "win32" else ["-O3", "-g0", "-ffp-contract=off"]
     kernel = Extension(
         "tfbus._kernel",
         [str((PACKAGE / "_c_kernel" / "kernel.c").relative_to(Path.cwd()))],
+        define_macros=[("KERNEL_SOURCES", str(checksum & 0x7FFF_FFFF))],
         extra_compile_args=flags,
         libraries=[] if sys.platform == "win32" else ["m"],
         py_limited_api=True,

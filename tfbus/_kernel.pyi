@@ -25,3 +25,4 @@ from tfbus._python_kernel import row_of_matrix as row_of_matrix
 Feed: Any
 Intake: Any
 Method: Any
+sources: int

@@ -754,9 +754,11 @@ class Paths:
         The clock that ages are counted from, which gives a stamp in ns.
     qualified : type or None
         The class of an answer with a policy. Only the compiled kernel gives such answers, and answers by age.
+    clock_namers : list or None
+        The `_clock_namers` of the errors that the compiled kernel raises.
     """
 
-    __slots__ = ("_changes", "_kind", "_latest", "_lock", "inserted", "now", "qualified", "recent")
+    __slots__ = ("_changes", "_kind", "_latest", "_lock", "clock_namers", "inserted", "now", "qualified", "recent")
 
     def __init__(self, lock: AbstractContextManager[Any], latest: Latest, kind: Any) -> None:
         self._lock = lock
@@ -766,6 +768,7 @@ class Paths:
         self.inserted: int = 0
         self.now: Any = None
         self.qualified: Any = None
+        self.clock_namers: Any = None
         self._changes = 0
 
     @property

@@ -26,7 +26,7 @@ can be pickled and copied, with their cause. Arguments of the wrong type raise `
 """
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from heapq import nlargest
 from itertools import islice
@@ -269,6 +269,11 @@ class DisconnectedError(TransformLookupError):
         return f"no path from {self.source!r} to {self.target!r}: {why}"
 
 
+def clock_named(namers: Iterable[Callable[[str], str]], frame: str) -> str:
+    """The clock that stamps a frame, in the words of the links of a bus; empty if it is the clock of the bus."""
+    return "".join(name(frame) for name in namers)
+
+
 class ExtrapolationError(TransformLookupError):
     """The samples of an edge on the path do not cover the stamp.
 
@@ -291,6 +296,7 @@ class ExtrapolationError(TransformLookupError):
         The `max_age` that the newest answer of a buffer exceeds, in ns; None if another reason decides.
     clock : str
         The clock of the sender beside the clock of the bus, in words, if a link knows that they differ; else empty.
+        Computed when first read.
     """
 
     child: str
@@ -301,7 +307,7 @@ class ExtrapolationError(TransformLookupError):
     slack: int
     ahead: int = 0
     max_age: int | None = None
-    clock: str = ""
+    _clock_namers: Sequence[Callable[[str], str]] = ()
 
     def __init__(
         self,
@@ -320,6 +326,19 @@ class ExtrapolationError(TransformLookupError):
         self.newest = newest
         self.authority = authority
         self.slack = slack
+
+    @cached_property
+    def clock(self) -> str:
+        """The clock of the sender, in words; empty if it is that of the bus."""
+        return clock_named(self._clock_namers, self.child)
+
+    @classmethod
+    def _facts(cls) -> dict[str, Any]:
+        return {**super()._facts(), "clock": str}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        facts = {**self.__dict__, "_clock_namers": (), "clock": self.clock}
+        return _restore, (type(self), self.args, facts, self.__cause__)
 
     def _asked(self) -> str:
         asked = "the latest" if isinstance(self.stamp, Latest) else format_stamp(self.stamp)

@@ -2,7 +2,8 @@
 
 The environment variable ``TFBUS_KERNEL`` asks for ``python`` or ``compiled``. Without it, the compiled kernel runs if
 it was built and can be loaded. In a checkout's root, Python finds the checkout before the installed package; if only
-the latter has a compiled kernel, a warning says so.
+the latter has a compiled kernel, a warning says so. A checkout has the sources of the compiled kernel, too. If they
+have changed since it was built, a warning says that, and the kernel in Python runs.
 """
 
 import os
@@ -15,7 +16,7 @@ def _choose(wanted: str | None) -> str:
     Raises
     ------
     ImportError
-        If the compiled kernel is asked for and cannot be loaded.
+        If the compiled kernel is asked for, and cannot be loaded or was built from other sources.
     ValueError
         If something else is asked for.
     """
@@ -24,14 +25,37 @@ def _choose(wanted: str | None) -> str:
     if wanted not in (None, "", "compiled"):
         raise ValueError(f"TFBUS_KERNEL must be 'python' or 'compiled', not {wanted!r}")
     try:
-        import tfbus._kernel  # noqa: F401
+        import tfbus._kernel as built
     except ImportError:
         if wanted == "compiled":
             raise
         if not wanted:
             _warn_of_shadowed_kernel()
         return "python"
-    return "compiled"
+    folder = os.path.join(os.path.dirname(__file__), "_c_kernel")  # noqa: PTH118, PTH120 - pathlib takes long to load
+    if not os.path.isdir(folder) or getattr(built, "sources", None) == _checksum(folder):  # noqa: PTH112
+        return "compiled"
+    stale = (
+        f"{built.__file__} was compiled from other sources than those in {folder}: compile it again with "
+        "pip install -e . in the checkout, or ask for the kernel in Python with TFBUS_KERNEL=python"
+    )
+    if wanted:
+        raise ImportError(stale)
+    import warnings
+
+    warnings.warn(f"{stale}, which runs now: lookups take more than ten times as long", RuntimeWarning, stacklevel=2)
+    return "python"
+
+
+def _checksum(folder: str) -> int:
+    """The checksum of the sources in a folder, as `tfbus/_build.py` compiles it into the kernel."""
+    import zlib
+
+    total = 0
+    for name in sorted(name for name in os.listdir(folder) if name.endswith((".c", ".h"))):  # noqa: PTH208
+        with open(os.path.join(folder, name), "rb") as file:  # noqa: PTH118, PTH123
+            total = zlib.crc32(file.read(), total)
+    return total & 0x7FFF_FFFF
 
 
 def _warn_of_shadowed_kernel() -> None:

@@ -118,7 +118,7 @@ class Matching:
                     self.drop_oldest(stream, "no partner")
             known = [(queue[0].stamp, queue[1].stamp if len(queue) > 1 else _NEVER) for queue in self.queues]
             width, later = _narrowest(pivot, known)
-            # The same if each message to come has the best stamp that it can have.
+            # The width if each message that may still come has its best possible stamp.
             hoped = [self._hoped(stream, pivot, *stamps) for stream, stamps in enumerate(known)]
             least, _ = _narrowest(pivot, hoped)
             if least > self._within:

@@ -68,7 +68,7 @@ nitpick_ignore_regex = [
     ("py:class", r"tfbus\.recording\.(recording\.(Decoded)?Block|formats\.\w+\.RawTransform)"),
     # An object with a tree, such as a buffer, whose static frames are saved.
     ("py:class", r"tfbus\.recording\.static_frames\.HasTree"),
-    # A buffer, of which a broadcaster knows only that it answers.
+    # The methods of a buffer that a broadcaster uses.
     ("py:class", r"tfbus\.bus\.broadcaster\.Awaits"),
     # The policy of a question that waits, which a program reads from it and never makes.
     ("py:class", r"tfbus\.tree\.lookup\.Policy"),

@@ -269,6 +269,7 @@ def test_a_rate_breaks_down_where_fewer_than_half_of_the_samples_come() -> None:
         samples = MovingSamples("base", stamps, np.array([ROW] * len(stamps)), none, none, None)
         found = list(samples.findings(Limits()))
         assert [finding.kind for finding in found] == kinds
+        assert [finding.worst for finding in found] == [left / 10.0] * len(kinds)
         # The fifth tenth begins after 40 s.
         assert {stamp for finding in found for stamp in (finding.first, finding.at)} <= {40 * 10**9}
 

@@ -67,6 +67,12 @@ NEEDS = {
         ("echo map base --ros ws://127.0.0.1:1", "cannot join ROS at ws://127.0.0.1:1: "),
         ("bridge ws://127.0.0.1:1 tf", "cannot join ROS at ws://127.0.0.1:1: "),
         *((f"bridge {ends}", "two places") for ends in ("dds dds", "tf domain:tf", "dds dds --connect tcp/a:1")),
+        (
+            "bridge tf domain:yard --odometry /odom",
+            "--odometry is for ROS, and neither 'tf' nor 'domain:yard' is there",
+        ),
+        ("static map", "CHILD is missing: tfbus static map CHILD, or a file that ends in"),
+        ("view --points /scan", "--points shows a topic of a recording: name the file"),
         ("foxglove --port -1", "--port"),
         ("foxglove --port 65536", "--port"),
         ("foxglove --origin robot.example", "robot.example"),

@@ -12,7 +12,7 @@ from hypothesis import given
 from support.strategies import samples
 
 import tfbus
-from tfbus import LATEST, InvalidTransformError, Transform, TransformStamped
+from tfbus import LATEST, Covariance, InvalidTransformError, Transform, TransformStamped, UncertainSample
 from tfbus.geometry.stamped import (
     GREATEST_BOUND,
     answer_of,
@@ -111,6 +111,18 @@ def test_copies_pickles_and_the_repr_of_a_sample_are_equal_to_it(sample: Transfo
     for twin in (sample.replace(), pickle.loads(pickle.dumps(sample)), copy.copy(sample), copy.deepcopy(sample)):
         assert twin == sample
         assert hash(twin) == hash(sample)
+
+
+def test_copies_pickles_and_the_repr_of_a_sample_have_its_error() -> None:
+    error = Covariance.of(xyz=0.1, rpy=0.02)
+    sample = UncertainSample("map", "base", 5, MOVE, "me", covariance=error, kind="drift")
+    for twin in (pickle.loads(pickle.dumps(sample)), copy.copy(sample), copy.deepcopy(sample)):
+        assert (type(twin), twin, twin.kind) == (UncertainSample, sample, "drift")
+        assert twin.covariance.matrix == pytest.approx(error.matrix)
+    assert (
+        repr(sample)
+        == f"UncertainSample('map', 'base', 5, {MOVE!r}, authority='me', covariance={error!r}, kind='drift')"
+    )
 
 
 def test_the_text_of_a_sample_has_frames_and_seconds() -> None:

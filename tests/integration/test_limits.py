@@ -36,6 +36,7 @@ links.rosbridge.rosbridge_server.MOST_REQUESTS links.rosbridge.rosbridge_server.
 links.rosbridge.rosbridge_server.MOST_CONFLATED links.rosbridge.rosbridge_server.MOST_AT_ONCE
 links.rosbridge.rosbridge_server.LONGEST_ERROR view.view._ORDERS
 view.session.EVENTS_KEPT view.session.SAMPLES view.session.MAX_TRAILS recording.points.MAX_POINTS
+recording.recording.MAX_PENDING
 view.session.MAX_MESSAGE view.meshes.MAX_BYTES view.meshes.MAX_NUMBERS view.meshes.MAX_VERTICES view.meshes.MAX_SHAPES
 plot.plots.SAMPLES plot.plots.LONGEST_NAME
 """

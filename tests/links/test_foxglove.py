@@ -21,7 +21,7 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 from websockets.typing import Origin, Subprotocol
 
-from tfbus import SECOND, Bus, BusClosedError, SimulatedClock, Transform, TransformStamped
+from tfbus import SECOND, Bus, BusClosedError, Registration, SimulatedClock, Transform, TransformStamped
 from tfbus._aio.web_server import MAX_CONNECTIONS
 from tfbus.links.foxglove import FoxgloveServer
 
@@ -119,13 +119,29 @@ async def application(server: FoxgloveServer) -> AsyncIterator[Application]:
         await anyio.to_thread.run_sync(found.close)
 
 
+class CountingBus(Bus):
+    """A bus that counts its open subscriptions: in this file, those of the server."""
+
+    subscriptions = 0
+
+    def subscribe(self, callback: Callable[..., object], removed: Callable[..., object] | None = None) -> Registration:
+        registration = super().subscribe(callback, removed)
+        self.subscriptions += 1
+
+        def close() -> None:
+            registration.close()
+            self.subscriptions -= 1
+
+        return Registration(close)
+
+
 @pytest.fixture
-def bus() -> Bus:
-    return Bus(SimulatedClock(START))
+def bus() -> CountingBus:
+    return CountingBus(SimulatedClock(START))
 
 
 @pytest.mark.every_loop
-async def test_an_application_gets_the_static_frames_and_then_what_is_published(bus: Bus) -> None:
+async def test_an_application_gets_the_static_frames_and_then_what_is_published(bus: CountingBus) -> None:
     bus.publish([static("base", "lidar", 2.0, stamp=START), moving("map", "old", START, 9.0)])
     turned = Transform.from_xyz_rpy((1.0, -2.0, 0.5), (0.1, 0.2, 0.3))
     async with FoxgloveServer(bus, 0) as server, application(server) as app:
@@ -139,8 +155,8 @@ async def test_an_application_gets_the_static_frames_and_then_what_is_published(
         assert base == (START + 5, "map", "base", turned.translation, turned.rotation)
         assert arm == (START + 7, "map", "arm", (3.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         assert (server.sent, server.not_sent) == (3, 0)
-        assert bus._subscribers.callbacks
-    assert not bus._subscribers.callbacks
+        assert bus.subscriptions == 1
+    assert bus.subscriptions == 0
 
 
 async def test_a_second_application_gets_the_static_frames_of_now(bus: Bus) -> None:
@@ -158,13 +174,13 @@ async def test_a_second_application_gets_the_static_frames_of_now(bus: Bus) -> N
             assert lidar[2:4] == ("lidar", (3.0, 0.0, 0.0))
 
 
-async def test_static_frames_that_went_while_nobody_had_subscribed_are_not_sent_later(bus: Bus) -> None:
+async def test_static_frames_that_went_while_nobody_had_subscribed_are_not_sent_later(bus: CountingBus) -> None:
     bus.publish([static("base", "lidar", 2.0, START), static("base", "gone", 1.0, START)])
     async with FoxgloveServer(bus, 0) as server:
         async with application(server) as first:
             first.subscribe()
             assert len(await anyio.to_thread.run_sync(first.transforms)) == 2
-        await until(lambda: not bus._subscribers.callbacks)
+        await until(lambda: bus.subscriptions == 0)
         bus.remove_frame("gone")
         async with application(server) as second, application(server) as third:
             for later in (second, third):
@@ -172,14 +188,14 @@ async def test_static_frames_that_went_while_nobody_had_subscribed_are_not_sent_
                 assert [each[2] for each in await anyio.to_thread.run_sync(later.transforms)] == ["lidar"]
 
 
-async def test_while_nobody_has_subscribed_the_bus_is_not_listened_to(bus: Bus) -> None:
+async def test_while_nobody_has_subscribed_the_bus_is_not_listened_to(bus: CountingBus) -> None:
     async with FoxgloveServer(bus, 0) as server:
         bus.publish(moving("map", "base", START))
-        assert not bus._subscribers.callbacks
+        assert bus.subscriptions == 0
         async with application(server) as app:
             app.subscribe()
-            await until(lambda: bool(bus._subscribers.callbacks))
-        await until(lambda: not bus._subscribers.callbacks)
+            await until(lambda: bus.subscriptions == 1)
+        await until(lambda: bus.subscriptions == 0)
         assert server.sent == 0
     assert server.address == ""
 
@@ -213,12 +229,12 @@ async def test_after_its_end_a_server_has_no_address_and_its_port_is_free(bus: B
     await until(lambda: is_free(port))
 
 
-async def test_a_server_that_ends_before_its_applications_leaves_the_bus(bus: Bus) -> None:
+async def test_a_server_that_ends_before_its_applications_leaves_the_bus(bus: CountingBus) -> None:
     async with FoxgloveServer(bus, 0) as server:
         app = await anyio.to_thread.run_sync(Application, server.address)
         app.subscribe()
-        await until(lambda: bool(bus._subscribers.callbacks))
-    assert not bus._subscribers.callbacks
+        await until(lambda: bus.subscriptions == 1)
+    assert bus.subscriptions == 0
     await anyio.to_thread.run_sync(app.close)
 
 

@@ -321,6 +321,20 @@ async def test_leaving_the_filter_drops_the_remaining_messages_and_ends_its_task
     assert pairs.arrived == 3
 
 
+async def test_a_message_that_has_waited_is_freed_with_its_reader_before_its_time_is_up(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    async with MessageFilter(streams.receive, buffer, "map", timeout=60.0) as pairs:
+        put(streams, Scan(5), Scan(6))
+        await settle()
+        bus.publish(moving("map", "laser", 5))
+        message, _ = await anext(pairs)
+        held = weakref.ref(message)
+        del message
+        gc.collect()
+        assert held() is None
+
+
 async def test_a_filter_that_was_left_is_freed(buffer: Buffer, streams: Streams) -> None:
     async def enter_and_leave(entered: MessageFilter[Scan, TransformStamped]) -> None:
         async with entered:

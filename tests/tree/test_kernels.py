@@ -656,13 +656,13 @@ def test_trees_and_buses_are_as_their_models_say_on_the_python_kernel_too() -> N
     assert done.returncode == 0, done.stdout
 
 
+CHOOSE = "from tfbus import kernel"
 WITHOUT = "import sys; sys.modules['tfbus._kernel'] = None\n"
 
 
 @needs_both
-@pytest.mark.parametrize("wanted", ["", "compiled"])
-def test_the_compiled_kernel_runs_where_it_was_built(wanted: str | None) -> None:
-    assert run(wanted).stdout.split() == ["compiled", "tfbus._kernel"]
+def test_the_compiled_kernel_runs_where_it_was_built() -> None:
+    assert run("").stdout.split() == ["compiled", "tfbus._kernel"]
 
 
 def test_the_twin_runs_where_the_compiled_kernel_is_missing() -> None:
@@ -685,11 +685,35 @@ def test_a_checkout_that_hides_an_installed_compiled_kernel_warns_once_unless_it
     assert bool(done.stderr) == (wanted is None)
 
 
+@needs_both
+def test_a_compiled_kernel_of_other_sources_does_not_run_and_the_warning_says_what_to_do(tmp_path: Path) -> None:
+    copied = Path(shutil.copytree(Path(tfbus.__file__).parent, tmp_path / "tfbus"))
+    # The other one is in a wheel, which has no sources.
+    sources = copied / "_c_kernel"
+    sources.mkdir(exist_ok=True)
+    (sources / "newer.h").write_text("int newer;")
+    script = f"""
+import sys, os
+sys.path.insert(0, {str(tmp_path)!r})
+try:
+    import tfbus.running_kernel
+except ImportError as error:
+    print(error)
+os.environ["TFBUS_KERNEL"] = ""
+"""
+    done = run("compiled", script + SHOW)
+    told = f"was compiled from other sources than those in {sources}: compile it again with pip install -e . in the "
+    refused, shown = done.stdout.splitlines()
+    assert told in refused
+    assert shown == "python tfbus._python_kernel"
+    assert done.stderr.count(told) == 1
+
+
 @pytest.mark.parametrize(
     ("wanted", "script", "error"),
     [
-        ("rust", SHOW, "ValueError: TFBUS_KERNEL must be 'python' or 'compiled', not 'rust'"),
-        ("compiled", WITHOUT + SHOW, "tfbus._kernel halted"),
+        ("rust", CHOOSE, "ValueError: TFBUS_KERNEL must be 'python' or 'compiled', not 'rust'"),
+        ("compiled", WITHOUT + CHOOSE, "tfbus._kernel halted"),
     ],
 )
 def test_a_kernel_that_is_not_there_is_an_error_that_names_it(wanted: str, script: str, error: str) -> None:

@@ -153,17 +153,15 @@ STEPS, WORLDS, LOOKED_AT = 300, 3000, {100, 200, 290, 299, 300}
 def driven(kind: Kind) -> tuple[TransformTree, dict[int, Matrix]]:
     """A tree of a robot whose errors are of a kind; and in many worlds, the truth at some steps, shape (n, 4, 4)."""
     rng, tree = np.random.default_rng(7), TransformTree(keep=None)
-    believed, matrix, true, truth = Transform(), np.zeros((6, 6)), np.tile(np.eye(4), (WORLDS, 1, 1)), {}
+    believed, matrix = Transform(), np.zeros((6, 6)) if kind == "drift" else FIX
+    true, truth = np.tile(np.eye(4), (WORLDS, 1, 1)), {}
     constant = white(rng, WORLDS, 6) @ root(FIX).T
     for step in range(STEPS + 1):
-        if kind == "independent":
-            matrix, true = FIX, disturbed(believed, rng.standard_normal((WORLDS, 6)) @ root(FIX).T)
-        elif kind == "constant":
-            matrix, true = FIX, disturbed(believed, constant)
-        elif step:
+        if kind == "drift" and step:
             true = true @ disturbed(AHEAD, rng.standard_normal((WORLDS, 6)) @ root(SLIP).T)
         if step in LOOKED_AT:
-            truth[step] = true
+            error = constant if kind == "constant" else rng.standard_normal((WORLDS, 6)) @ root(FIX).T
+            truth[step] = true if kind == "drift" else disturbed(believed, error)
         sample = UncertainSample("odom", "base", step * STEP, believed, covariance=Covariance(matrix), kind=kind)
         tree.insert(sample)
         if kind == "drift":
@@ -233,7 +231,7 @@ def test_close_stamps_between_the_same_samples_differ_little_even_if_the_samples
 
     def spread(a: int, b: int) -> float:
         pair = [tree.lookup("map", "marker", at, covariance=True) for at in (a, b)]
-        return float(joint(pair).difference(0, 1)[0, 0])
+        return float(joint([*pair, *pair]).difference(1, 2)[0, 0])
 
     # (s' - s) (S0 + S1) within a segment; two independent ones at samples, or across whole segments.
     assert [spread(0, 0), spread(500, 501), spread(0, 1000), spread(0, 2000)] == pytest.approx([0.0, 0.002, 2.0, 2.0])
@@ -241,14 +239,16 @@ def test_close_stamps_between_the_same_samples_differ_little_even_if_the_samples
     assert spread(500, 1500) == pytest.approx(1.5)
 
 
-def test_a_sender_that_becomes_surer_gives_no_negative_variance() -> None:
+@pytest.mark.parametrize(("xyz", "rpy"), [(1.0, 0.1), (1e5, 1e-6)])
+def test_a_sender_that_becomes_surer_gives_no_negative_variance(xyz: float, rpy: float) -> None:
     rng = np.random.default_rng(9)
+    surer = np.diag([0.0, xyz, 0.0, rpy, 0.0, 0.0]) ** 2
     for kind in ("independent", "drift", "constant"):
         tree = TransformTree(keep=None)
         for stamp in range(12):
-            error = Covariance(random_covariance(rng, 1.0, 0.1) if stamp % 5 else np.diag([0.0, 1, 0, 0.1, 0, 0]))
+            error = Covariance(random_covariance(rng, xyz, rpy) if stamp % 5 else surer)
             tree.insert(UncertainSample("a", "b", 10 * stamp, random_transform(rng), covariance=error, kind=kind))
-        answers = [tree.lookup("a", "b", at, covariance=True) for at in range(0, 110, 3)]
+        answers = [tree.lookup("a", "b", at, covariance=True) for at in range(0, 110, 7)]
         assert is_positive(joint(answers).covariance)
         travels = [tree.lookup("b", "b", at, source_at=110 - at, fixed="a", covariance=True) for at in range(0, 110, 7)]
         assert is_positive(joint(travels).covariance)

@@ -87,7 +87,8 @@ def test_a_page_without_frames_waits_and_one_whose_fixed_frame_is_gone_says_so()
     browser = Browser(tree)
     assert (browser.said["frames"]["names"], browser.said["frames"]["waiting"]) == ([], True)
     tree.insert_many([static("map", "base"), static("map", "dock")])
-    assert browser.look().do("fixed", frame="base").x == {"base": 0.0, "map": 0.0, "dock": 0.0}
+    browser.page.clouds["scan"] = Points(PointCloud("dock", LATEST, np.zeros((1, 3))), 0.02, GREY)
+    assert browser.look().do("fixed", frame="base").x == {"base": 0.0, "map": 0.0, "dock": 0.0, "scan": 0.0}
     tree.remove_frame("base")
     browser.look()
     assert (browser.said["frames"]["fixed"], browser.said["frames"]["names"]) == ("base", ["dock", "map"])

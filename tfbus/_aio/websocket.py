@@ -60,7 +60,7 @@ class WebSocket:
     max_size : int
         The largest message that is received, in bytes or characters.
     kind : ConnectionType
-        The end that this one is. `connect` and `accept` make a websocket of each kind.
+        Client or server. `connect` and `accept` make a websocket of each kind.
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ class WebSocket:
         await self._send(TextMessage(message) if isinstance(message, str) else BytesMessage(message))
 
     async def ping(self) -> None:
-        """Have the other end answer, which `heard` tells; raises `OSError` if it is gone."""
+        """Ask the other end for a sign, which moves `heard`; raises `OSError` if it is gone."""
         await self._send(Ping(b""))
 
     async def close(self) -> None:
@@ -204,7 +204,7 @@ class WebSocket:
                 self._take(data)
             except _GONE:
                 raise ConnectionResetError("the connection is gone") from None
-            # Bytes that are no websocket also get a few other errors out of the library.
+            # The library also raises a few other errors for bytes that are no websocket.
             except Exception as error:
                 if isinstance(error, OSError):
                     raise
@@ -219,7 +219,7 @@ class WebSocket:
         try:
             data = self._connection.send(event)
         except ProtocolError:
-            # Its text has the whole message.
+            # The text of the error repeats the whole message.
             raise ConnectionResetError("the websocket is closed") from None
         async with self._sending:
             if self._cut_short:

@@ -43,7 +43,7 @@ static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType, 
 static PyObject *empty_string, *raise_string, *drop_string, *at_string, *paths_string, *memory_string;
 static PyObject *child_string, *source_at_string, *fixed_string, *max_age_string, *not_before_string;
 static PyObject *not_after_string, *tolerance_string, *max_gap_string, *extrapolate_string, *nanoseconds_string;
-static PyObject *policy_use_string, *error_string, *passed_string, *create_future_string, *set_result_string;
+static PyObject *policy_use_string, *error_string, *namers_string, *passed_string, *create_future_string, *set_result_string;
 static PyObject *end_string, *name_string, *expire_string, *abort_string, *orders_string, *forget_string;
 static PyObject *locked_string, *mask_string; /* CPython keeps each new object of a name that it looks up in a class */
 static PyObject *bound_method; /* types.MethodType */

@@ -75,7 +75,7 @@ module_exec(PyObject *module)
                    {"source_at", &source_at_string}, {"fixed", &fixed_string}, {"max_age", &max_age_string},
                    {"not_before", &not_before_string}, {"not_after", &not_after_string}, {"tolerance", &tolerance_string}, {"max_gap", &max_gap_string},
                    {"extrapolate", &extrapolate_string}, {"_nanoseconds", &nanoseconds_string},
-                   {"_policy_use", &policy_use_string}, {"extrapolation_error", &error_string},
+                   {"_policy_use", &policy_use_string}, {"extrapolation_error", &error_string}, {"_clock_namers", &namers_string},
                    {"create_future", &create_future_string}, {"set_result", &set_result_string}, {"end", &end_string}, {"name", &name_string}, {"expire", &expire_string}, {"abort", &abort_string}, {"orders", &orders_string},
                    {"forget", &forget_string}, {"locked", &locked_string}, {"mask", &mask_string}};
     for (size_t i = 0; i < sizeof strings / sizeof *strings; i++) {
@@ -100,6 +100,12 @@ module_exec(PyObject *module)
         || add_type(module, "Method", &method_spec, &MethodType) < 0) {
         return -1;
     }
+#ifdef KERNEL_SOURCES
+    /* In a checkout, tfbus/running_kernel.py compares it with the checksum of these files. */
+    if (PyModule_AddIntConstant(module, "sources", KERNEL_SOURCES) < 0) {
+        return -1;
+    }
+#endif
     return 0;
 }
 

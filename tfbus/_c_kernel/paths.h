@@ -697,6 +697,7 @@ typedef struct {
     PyObject *kind;          /* the class of an answer, made of Sample */
     PyObject *now;           /* the clock that ages are counted from, called for a stamp; None or NULL if there is none */
     PyObject *qualified;     /* the class of an answer with a policy, derived from `kind`; None or NULL if there is none */
+    PyObject *clock_namers;  /* `ExtrapolationError` names the clock of a sender by them; NULL if there are none */
     long long inserted;      /* samples at new stamps */
     long long version;       /* another one after each change */
 } Paths;
@@ -714,7 +715,7 @@ paths_are_free(const Paths *self)
     return held == Py_False;
 }
 
-REFERENCES(paths, 6)
+REFERENCES(paths, 7)
 
 static int
 paths_init(Paths *self, PyObject *args, PyObject *kwargs)
@@ -876,7 +877,8 @@ paths_refuse(const Paths *self, PyObject *target, PyObject *source, PyObject *nu
     if (self->now == NULL || self->now == Py_None || paths_now(self, &now)) {
         PyObject *error = newest > now ? NULL : PyObject_CallMethodObjArgs(OBJECT(edge), error_string, number, NULL);
         /* Another thread may have inserted the missing samples meanwhile. */
-        if (error != NULL && !chain_covers(path, at) && PyExceptionInstance_Check(error)) {
+        if (error != NULL && !chain_covers(path, at) && PyExceptionInstance_Check(error)
+            && (self->clock_namers == NULL || PyObject_SetAttr(error, namers_string, self->clock_namers) == 0)) {
             PyErr_SetObject(OBJECT(Py_TYPE(error)), error);
         }
         Py_XDECREF(error);
@@ -1117,6 +1119,7 @@ static PyMemberDef paths_members[] = {
     {"version", T_LONGLONG, offsetof(Paths, version), 0, PyDoc_STR("Another number after each change.")},
     {"now", T_OBJECT, offsetof(Paths, now), 0, PyDoc_STR("The clock that ages are counted from: it gives a stamp.")},
     {"qualified", T_OBJECT, offsetof(Paths, qualified), 0, PyDoc_STR("The class of an answer with a policy.")},
+    {"clock_namers", T_OBJECT, offsetof(Paths, clock_namers), 0, PyDoc_STR("For errors: the namers of clocks.")},
     {NULL}
 };
 

@@ -13,7 +13,7 @@ from tfbus.buffer.lookups import LocalNames, Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
 from tfbus.data import PointCloud, Stamped, do_transform
-from tfbus.errors import LookupTimeoutError, TransformLookupError
+from tfbus.errors import LookupTimeoutError, TransformLookupError, clock_named
 from tfbus.frames import as_prefix, is_frame
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.registration import Registration
@@ -152,6 +152,7 @@ class Buffer:
         self._forest = self._lookups.forest = forest
         self._paths = forest.paths if self._local_names is None else forest.local_paths()
         self._paths.now = self._lookups.now
+        self._paths.clock_namers = self.bus._clock_namers
         plain = self._local_names is None and forest is self._share.live.forest
         self._feed = self._lookups.feed if plain else None
 
@@ -748,7 +749,8 @@ class Buffer:
         )
         for error in found.errors:
             self._lookups.complete(error, max_age, bounds)
-        edges = (replace(edge, clock=self.bus._clock_of(edge.child)) for edge in found.edges)
+        namers = self.bus._clock_namers
+        edges = (replace(edge, clock=clock_named(namers, edge.child)) for edge in found.edges)
         found = replace(found, edges=tuple(edges))
         return found if self._local_names is None else self._local_names.explanation(found, target, source)
 

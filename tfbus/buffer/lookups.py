@@ -449,7 +449,7 @@ class Lookups:
         # The clock alone nearly always tells that it is not; how far ahead a stamp may be is asked only then.
         if error.newest is not None and self._clock.now() < error.newest > self.bus._newest_plausible():
             error.ahead = error.newest - self._clock.now()
-        error.clock = self.bus._clock_of(error.child)
+        error._clock_namers = self.bus._clock_namers
 
     def lookup_nowait(self, question: Question, ask: Callable[..., TransformStamped] = answer) -> TransformStamped:
         """The answer, or an error at once. `ask` may be another function with the arguments of `answer`."""

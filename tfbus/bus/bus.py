@@ -225,7 +225,7 @@ class Bus:
         self._trees: dict[LiveTree, tuple[int, int] | None] = {}
         self._late: dict[LiveTree, LateBuffer] = {}
         self._streams: list[Stream] = []
-        # Everybody but the buffers: some containers, each with the function that gives a batch to all that is in it.
+        # The listeners beside the buffers, by kind, each with the function that gives them a batch.
         self._listeners: tuple[tuple[Sized, Callable[[Batch], object]], ...] = (
             (self._streams, self._put_into_streams),
             (self._events, self._note_in_events),
@@ -247,8 +247,8 @@ class Bus:
         self._removals = 0
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
         self._relay: object = None
-        # Links know the clock that stamps a frame; they tell it in words.
-        self._clock_of: Callable[[str], str] = lambda _: ""
+        # Links know the clock that stamps a frame; they name it in words.
+        self._clock_namers: list[Callable[[str], str]] = []
         # Links, recorders and the like; a child made by `fork` has them no more.
         self._entered = self._owner.entered
         self._jumps = self.clock.on_jump(self._clock_jumped)

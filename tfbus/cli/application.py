@@ -56,6 +56,7 @@ _EXIT_STATUSES = (
 )
 _INSTALL_COMPLETION = "Install completion for the current shell, and exit."
 _OPTIONS_OF_ALL = "Options of all commands"
+_FOR_ALL_COMMANDS = ("-h", "--help", "--version", "--install-completion", "--log-level")
 _LOG_LEVEL = "Show log lines of this level and above on standard error."
 
 _LogLevel = Literal["debug", "info", "warning", "error", "critical"]
@@ -77,8 +78,12 @@ def parser_of(words: Sequence[str]) -> Callable[[], _Program | None]:
 
     def parse() -> _Program | None:
         with deferring() as load:
-            prepare, arguments, _ = app.meta.parse_args(words, exit_on_error=False, print_error=False)
-            program: _Program | None = prepare(*arguments.args, **arguments.kwargs)
+            if any(word.startswith(_FOR_ALL_COMMANDS) for word in words):
+                prepare, arguments, _ = app.meta.parse_args(words, exit_on_error=False, print_error=False)
+                program: _Program | None = prepare(*arguments.args, **arguments.kwargs)
+            else:
+                # To look for these options takes as long as all else.
+                program = app.meta.default_command(*words)
             if program is not None:
                 load()
         return program

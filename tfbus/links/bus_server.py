@@ -72,4 +72,4 @@ class BusServer(AsyncOnly):
         """Prepare to answer."""
 
     async def _close(self) -> None:
-        """End what `_open` has begun, as far as it came."""
+        """End the work that `_open` has begun."""

@@ -13,9 +13,9 @@ A sign of life ends with the sender's steady time and base and, for each peer th
 the steady time that the peer told, and the own one when that came. So each sign that comes completes an exchange of
 four stamps (Mills, RFC 5905, section 8): with the times t1 of sending, t2 of hearing, t3 of answering and t4 of hearing
 the answer, the peer's steady clock is ahead by ``((t2 - t1) + (t3 - t4)) / 2``, and the round trip took
-``(t4 - t1) - (t3 - t2)``. The error is half the round trip at most, whatever the delays of the two directions are, and
-beside it what two clocks may drift apart meanwhile, `TOLERANCE` of the time. Of the last `KEPT` exchanges the one with
-the smallest bound now is believed: usually that of the lowest round trip (the clock filter of RFC 5905, section 10). An
+``(t4 - t1) - (t3 - t2)``. The error is half the round trip at most, whatever the delays of the two directions are, plus
+the drift of the two clocks since then, at most `TOLERANCE` of the time. Of the last `KEPT` exchanges the one with the
+smallest bound now is believed: usually that of the lowest round trip (the clock filter of RFC 5905, section 10). An
 exchange that contradicts it shows that a steady clock has stopped, as in a machine that slept; it replaces all others.
 
 Placing
@@ -158,7 +158,7 @@ class ClockFilter:
         self._best: Exchange | None = None
         self.base: int | None = None
         self.told: float | None = None
-        # The exchanges before it are of a clock that was set since.
+        # When a clock was set: earlier exchanges do not show its drift.
         self._set_at: int | None = None
         self._steady: tuple[int, int] | None = None
 
@@ -183,7 +183,7 @@ class ClockFilter:
         self._best = min(self._exchanges, key=_grown)
 
     def was_set(self) -> None:
-        """Note that the clock of either bus was set; what its base was before says nothing of its drift."""
+        """Note that the clock of either bus was set: earlier exchanges no longer show its drift."""
         self._set_at = self._exchanges[-1].at if self._exchanges else None
 
     def ahead(self, now: int) -> tuple[int, int] | None:
@@ -237,7 +237,7 @@ class ClockFilter:
 
 
 def _grown(one: Exchange) -> float:
-    """The bound of an exchange at any time, but for a number that all have in common."""
+    """The bound of an exchange at any time, less a number that all exchanges have in common."""
     return one.bound - TOLERANCE * one.at
 
 

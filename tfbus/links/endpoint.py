@@ -121,7 +121,7 @@ class Endpoint(Outbox, ABC):
         return ()
 
     def tell_time(self, stamp: int) -> None:
-        """Tell peers the time of this bus's clock, in ns, with all that is published from now on."""
+        """Tell peers the time of this bus's clock, in ns, with the samples that are published from now on."""
         if self.time is not None and stamp < self.time:
             # Samples that were published before the jump are of the time before it.
             self.send()

@@ -1,7 +1,7 @@
 """`FoxgloveServer`, which shows a bus to the Foxglove application.
 
-The library answers any web page. So it listens at an address of the loopback that no page can guess, and what comes to
-the address of the server goes through a `WebDoor` first.
+The library answers any web page. So it listens at an address of the loopback that no page can guess, and
+connections to the address of the server go through a `WebDoor` first.
 """
 
 import secrets
@@ -40,7 +40,7 @@ _STAMP_END = 2**32 * SECOND
 class FoxgloveServer(BusServer):
     """Sends everything that a bus publishes to the Foxglove application: ``async with FoxgloveServer(bus) as server``.
 
-    The transforms are messages of the type ``foxglove.FrameTransforms``; who subscribes later gets the static ones at
+    The transforms are messages of the type ``foxglove.FrameTransforms``; a later subscriber gets the static ones at
     once. While nobody has subscribed, nothing is converted. A slow application loses its oldest messages, a thousand
     behind the newest.
 
@@ -151,7 +151,7 @@ class FoxgloveServer(BusServer):
             return
 
     def _follow_subscriptions(self) -> None:
-        """Listen to the bus while somebody has subscribed, and send the static frames to who has not got them yet."""
+        """Listen to the bus while somebody has subscribed, and send the static frames to new subscribers."""
         if self._server is None:
             return
         subscribers = self._listener.subscribers

@@ -217,7 +217,7 @@ class Relay:
                     source.outbox = source.peer = None
 
     def route(self) -> None:
-        """Find anew which views get what comes by which view, because links or views have come or gone."""
+        """Route the samples of each view to other views anew, because links or views have come or gone."""
         own = [(outbox, outbox.own) for outbox in self._outboxes if outbox.own is not None]
         self._route = tuple(view for _, view in own)
         for outbox in self._outboxes:
@@ -292,7 +292,7 @@ class Relay:
         return origin == self.replica.origin or origin in self._reached
 
     def reach_changed(self, outbox: Outbox) -> tuple[set[bytes], set[bytes]]:
-        """The buses that are reached only since the ways of a link have changed, and those that no longer are."""
+        """The buses that the changed ways of a link reach newly, and the buses that are no longer reached."""
         before = self._reached
         self._reached = {origin for one in self._outboxes for origin, _ in one.ways()}
         for other in self._outboxes:
@@ -431,7 +431,7 @@ def relay_of(bus: Bus) -> Relay:
     """The relay of a bus, which its links share; the bus itself holds it."""
     if not isinstance(bus._relay, Relay):
         relay = bus._relay = Relay(bus)
-        bus._clock_of = relay.clock_of
+        bus._clock_namers.append(relay.clock_of)
     return bus._relay
 
 

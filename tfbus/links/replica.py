@@ -529,7 +529,7 @@ class View:
     digest : int
         The digest of its settled entries.
     route : tuple of View
-        The views to which all that comes by this one is added: this one, and those that the other links tell.
+        The views that get the samples of this one: itself, and the views that the other links tell.
     """
 
     def __init__(self, replica: Replica, frames: frozenset[str] | None = None) -> None:

@@ -155,9 +155,9 @@ class Received:
     moving : bool
         Whether the item may be dropped under load, because newer data will follow.
     urgent : bool
-        Whether it is read before all that is not.
+        Whether it is read before items that are not urgent.
     follows : bool
-        Whether an urgent item is read after all that waits of its sender.
+        Whether an urgent item is read after the waiting items of its sender.
     """
 
     sender: str

@@ -590,7 +590,7 @@ class MessageFilter(AsyncOnly, Generic[MessageT, AnswerT]):
         finally:
             for registration in self._registrations:
                 registration.close()
-            # They stay due, because no attendant comes if a callback changes the target.
+            # A callback that changes the target calls no attendant for messages that are due.
             self._due = dict.fromkeys(self._pending.messages)
             for pending in self._due:
                 self._drop(pending, "closed", self._blocker(pending))

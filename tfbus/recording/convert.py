@@ -12,7 +12,7 @@ from json import dumps
 from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -29,6 +29,14 @@ from tfbus.recording.formats.copies import (
     SqliteCopy,
     transform_channel,
     write_transforms,
+)
+from tfbus.recording.formats.covariances import (
+    SUFFIX,
+    RawCovariance,
+    covariance_channel,
+    holds_covariances,
+    read_covariances,
+    write_covariances,
 )
 from tfbus.recording.formats.storage import (
     AUTHORITIES,
@@ -48,6 +56,8 @@ from tfbus.recording.formats.transforms import (
 )
 from tfbus.recording.recording import MAX_DETAILS, open_storage
 from tfbus.tf_message import MalformedMessageError
+
+Raw = TypeVar("Raw", RawTransform, RawCovariance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +107,12 @@ class Edits:
         """Whether messages with transforms change; static ones that are left out do not count."""
         return self.frames is not None or bool(self.rename) or bool(self.prefix)
 
-    def keeps(self, transform: RawTransform) -> bool:
+    def keeps(self, transform: RawTransform | RawCovariance) -> bool:
         """Whether a transform stays."""
         return self.frames is None or _bare(transform.child) in self.frames
 
-    def apply(self, transform: RawTransform) -> RawTransform:
-        """A transform with the new names of its frames."""
+    def apply(self, transform: Raw) -> Raw:
+        """A transform or a covariance with the new names of its frames."""
         if not (self.rename or self.prefix):
             return transform
         return transform._replace(parent=self._rename(transform.parent), child=self._rename(transform.child))
@@ -375,6 +385,8 @@ class _Run:
         try:
             if holds_transforms(channel):
                 self._write_transforms(received, channel, payload)
+            elif holds_covariances(channel) and (self._edits.changes_messages or self._edits.drop_static):
+                self._write_covariances(received, channel, payload)
             else:
                 self._copy.write(channel, received, decompressed(channel, payload))
                 self.result.messages += 1
@@ -427,6 +439,16 @@ class _Run:
         self.result.messages += 1
         self.result.transforms += len(kept)
 
+    def _write_covariances(self, received: int, channel: Channel, payload: bytes) -> None:
+        found = read_covariances(bounded(payload), channel.encoding == "ros1")
+        kept = [self._edits.apply(each) for each in found if self._edits.keeps(each)]
+        if kept and not (self._edits.drop_static and self._is_static(channel)):
+            key = channel, ()
+            if key not in self._outputs:
+                self._outputs[key] = covariance_channel(channel.topic, dict(channel.metadata))
+            self._copy.write(self._outputs[key], received, write_covariances(kept))
+            self.result.messages += 1
+
     def _output(self, channel: Channel, runs: tuple[tuple[str, int], ...]) -> Channel:
         """The output channel for the transforms of an input channel, from the given authorities."""
         runs = runs if len(runs) > 1 else tuple((name, 1) for name, _ in runs)
@@ -452,7 +474,13 @@ class _Run:
         return self._decoders[channel]
 
     def _is_wanted(self, channel: Channel) -> bool:
-        return self._topics is None or channel.topic.removeprefix("/") in self._topics
+        return self._topics is None or _topic_of(channel).removeprefix("/") in self._topics
 
     def _is_static(self, channel: Channel) -> bool:
-        return self._is_wanted(channel) and holds_transforms(channel) and channel.topic.endswith("_static")
+        holds = holds_transforms(channel) or holds_covariances(channel)
+        return self._is_wanted(channel) and holds and _topic_of(channel).endswith("_static")
+
+
+def _topic_of(channel: Channel) -> str:
+    """The topic of a channel; for covariances, that of their transforms."""
+    return channel.topic.removesuffix(SUFFIX) if holds_covariances(channel) else channel.topic

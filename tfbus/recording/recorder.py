@@ -84,8 +84,9 @@ class Recorder(AsyncOnly):
     """Records all samples of a bus: ``async with Recorder(bus, "run.mcap")``. The latched static samples come first.
 
     The file is MCAP as ROS 2 writes it, with the topics ``/tf`` and ``/tf_static``, so any tool that knows these can
-    read it; `tfbus.recording.load` and `Player` also find the authorities in it. A worker thread writes, and publishers
-    never wait for it. If the process is killed, only the last half second or so is lost.
+    read it; `tfbus.recording.load` and `Player` also find the authorities in it, and the covariances of samples that
+    have one. A worker thread writes, and publishers never wait for it. If the process is killed, only the last half
+    second or so is lost.
 
     Parameters
     ----------

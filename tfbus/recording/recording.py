@@ -17,7 +17,8 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
@@ -26,7 +27,9 @@ from typing import Final, NamedTuple, Self, TypeAlias
 from tfbus.errors import InvalidTransformError, MissingRecordingError, RecordingError, pip_install
 from tfbus.frames import is_frame
 from tfbus.geometry.stamped import MAX_TRANSLATION, Batch, TransformStamped, is_within, not_physical
+from tfbus.geometry.uncertain import Belief, with_belief
 from tfbus.plain import printable
+from tfbus.recording.formats.covariances import SUFFIX, Key, beliefs_in, holds_covariances
 from tfbus.recording.formats.storage import Channel, Packed, Storage, Stored, StoredMessage, blocks_of, pack
 from tfbus.recording.formats.trajectories import TrajectoryStorage, is_text
 from tfbus.recording.formats.transforms import (
@@ -35,6 +38,7 @@ from tfbus.recording.formats.transforms import (
     ChannelDecoder,
     ColumnDecoder,
     Columns,
+    bounded,
     holds_transforms,
     needs_child,
 )
@@ -150,6 +154,9 @@ class Selection:
 
     def choose(self, channel: Channel) -> Choice | None:
         """The way in which a channel is read; None if it is not."""
+        if holds_covariances(channel):
+            # As the topic that they belong to.
+            channel = replace(channel, topic=channel.topic.removesuffix(SUFFIX), type="tf2_msgs/msg/TFMessage")
         name = channel.topic.removeprefix("/")
         if name in self.odometry and needs_child(channel) is (self.odometry[name] is not None):
             return Choice(False, self._prefix, self.odometry[name], self._invert)
@@ -182,18 +189,22 @@ class Block:
     content : Packed or list of StoredMessage
     columns : ColumnDecoder
     decode : callable
-        Decodes one message.
+        Decodes one message; gives None for one that tells of later ones.
+    pending : mapping
+        It is empty, unless messages before have told of these.
     """
 
     def __init__(
         self,
         content: Stored,
         columns: ColumnDecoder,
-        decode: Callable[[StoredMessage], RecordedMessage],
+        decode: Callable[[StoredMessage], RecordedMessage | None],
+        pending: Mapping[Key, Belief],
     ) -> None:
         self._content = content
         self._columns = columns
         self._decode = decode
+        self._pending = pending
 
     def __len__(self) -> int:
         return self._content.size if isinstance(self._content, Packed) else len(self._content)
@@ -205,12 +216,14 @@ class Block:
 
     def columns(self) -> list[Columns] | None:
         """All samples, by frame and authority; None if the messages have to be decoded one by one."""
+        if self._pending:
+            return None
         packed = self._content if isinstance(self._content, Packed) else pack(self._content)
         return None if packed is None else self._columns.decode(packed)
 
     def messages(self) -> Iterator[RecordedMessage]:
         """All messages, one by one."""
-        return map(self._decode, self.stored)
+        return filter(None, map(self._decode, self.stored))
 
 
 class DecodedBlock:
@@ -230,6 +243,8 @@ class DecodedBlock:
         return iter(self._messages)
 
 
+MAX_PENDING: Final = 10_000
+"""The most covariances that wait for their transforms."""
 _FIRST_BYTES: Final = 64
 _SHOWN: Final = 10
 _JOINT_TYPES: Final = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
@@ -295,6 +310,8 @@ class Recording:
         self._storage: Storage | None = storage
         self._selection = selection
         self._decoders: dict[Channel, ChannelDecoder] = {}
+        # The channels of covariances, and the ways in which the topics that they belong to are read.
+        self._covariances: dict[Channel, Choice] = {}
         self._unwanted: set[Channel] = set()
         self._check_topics(storage)
 
@@ -313,7 +330,8 @@ class Recording:
         """The number of messages with transforms; None if only reading the whole file would tell."""
         if not self._opened.complete:
             return None
-        return sum(count or 0 for channel, count in self._opened.channels.items() if self._is_wanted(channel))
+        counts = self._opened.channels.items()
+        return sum(count or 0 for each, count in counts if self._is_wanted(each) and each in self._decoders)
 
     @property
     def topics(self) -> tuple[RecordedTopic, ...]:
@@ -368,7 +386,8 @@ class Recording:
     def _messages(self, storage: Storage, since: int | None, until: int | None) -> Iterator[RecordedMessage]:
         if since is not None:
             yield from self._latched(storage, since)
-        yield from map(self._message, storage.messages(self._is_wanted, since, until))
+        decode = partial(self._message, {})
+        yield from filter(None, map(decode, storage.messages(self._is_wanted, since, until)))
 
     def blocks(self, since: int | None = None, until: int | None = None) -> Iterator[Block | DecodedBlock]:
         """All messages as `messages` gives them, in blocks that can be decoded at once; for `load` and `summarise`.
@@ -382,16 +401,19 @@ class Recording:
         """
         storage = self._opened
         columns = ColumnDecoder(self._decoders)
+        pending: dict[Key, Belief] = {}
+        decode = partial(self._message, pending)
         if since is not None:
             yield DecodedBlock(list(self._latched(storage, since)))
         for content in blocks_of(storage, self._is_wanted, since, until):
-            yield Block(content, columns, self._message)
+            yield Block(content, columns, decode, pending)
 
     def _latched(self, storage: Storage, since: int) -> Iterator[RecordedMessage]:
         """The newest static transform of each frame from before a log time."""
         latched: dict[str, TransformStamped] = {}
-        for stored in storage.messages(self._is_static, None, since - 1):
-            for sample in self._message(stored).batch:
+        decode = partial(self._message, {})
+        for message in filter(None, map(decode, storage.messages(self._is_static, None, since - 1))):
+            for sample in message.batch:
                 # In the order of the newest samples.
                 latched.pop(sample.child, None)
                 latched[sample.child] = sample
@@ -399,34 +421,41 @@ class Recording:
             yield RecordedMessage(since, (sample,), ())
 
     def _is_wanted(self, channel: Channel) -> bool:
-        if channel in self._decoders:
+        if channel in self._decoders or channel in self._covariances:
             return True
         if channel in self._unwanted:
             return False
         choice = self._selection.choose(channel)
         if choice is None:
             self._unwanted.add(channel)
+        elif holds_covariances(channel):
+            self._covariances[channel] = choice
         else:
             self._decoders[channel] = ChannelDecoder(channel, *choice)
         return choice is not None
 
     def _is_static(self, channel: Channel) -> bool:
-        return self._is_wanted(channel) and self._decoders[channel].static
+        return self._is_wanted(channel) and (self._decoders.get(channel) or self._covariances[channel]).static
 
-    def _message(self, stored: StoredMessage) -> RecordedMessage:
+    def _message(self, pending: dict[Key, Belief], stored: StoredMessage) -> RecordedMessage | None:
+        """A message with its samples; None for covariances, which wait for theirs in `pending`."""
         received, channel, payload = stored
         if isinstance(channel, MalformedMessageError):
             return RecordedMessage(received, (), (channel,))
-        decoder = self._decoders[channel]
-        plain = None if decoder.decode_plain is None else decoder.decode_plain(payload)
+        decoder = self._decoders.get(channel)
+        plain = None if decoder is None or decoder.decode_plain is None else decoder.decode_plain(payload)
         if plain is not None:
-            return RecordedMessage(received, plain, ())
+            return RecordedMessage(received, _believed(plain, pending) if pending else plain, ())
         try:
+            if decoder is None:
+                _note_beliefs(pending, channel, payload, self._covariances[channel].prefix)
+                return None
             samples, errors = decoder.decode(payload)
         except MalformedMessageError as error:
             # Its traceback would keep the payload.
             return RecordedMessage(received, (), (MalformedMessageError(error.reason, error.detail),))
-        return RecordedMessage(received, tuple(filter(None, samples)), tuple(errors))
+        batch = tuple(filter(None, samples))
+        return RecordedMessage(received, _believed(batch, pending) if pending else batch, tuple(errors))
 
     def _check_topics(self, storage: Storage) -> None:
         """Raise `RecordingError` if a topic that was asked for is not there, as far as the file tells."""
@@ -481,6 +510,23 @@ class Recording:
         if self._storage is None:
             raise ValueError(f"the recording {printable(str(self.path))} is closed")
         return self._storage
+
+
+def _note_beliefs(pending: dict[Key, Belief], channel: Channel, payload: bytes, prefix: str) -> None:
+    """Keep the covariances of a message for the next transforms; raises `MalformedMessageError`."""
+    found = beliefs_in(bounded(payload), channel.encoding == "ros1", prefix)
+    lost = len(pending) if len(pending) + len(found) > MAX_PENDING else 0
+    if lost:
+        pending.clear()
+    pending |= found
+    if lost:
+        raise MalformedMessageError("covariance", f"{lost:,} covariances have come without their transforms")
+
+
+def _believed(batch: Batch, pending: dict[Key, Belief]) -> Batch:
+    """The batch with those of its covariances that have come."""
+    beliefs = ((sample, pending.pop(sample._fields[:3], None)) for sample in batch)
+    return tuple(sample if belief is None else with_belief(sample, belief) for sample, belief in beliefs)
 
 
 def _remark(topic: RecordedTopic) -> str:
@@ -540,8 +586,8 @@ def open_recording(
     size, or 64 MiB if that is more, in a nameless temporary file. An index of more than 64 MiB is not used. The
     descriptions of all channels and types take at most 64 MiB. All compressed chunks together unfold to at most 1,000
     times the size of the file, or 1 GiB if that is more; later chunks are left out. Messages of chunks that overlap in
-    time are sorted in memory up to 512 MiB. A trajectory has at most 5 million poses, and 4,096 bytes a line. So
-    reading a hostile file takes at most 2 GiB of memory.
+    time are sorted in memory up to 512 MiB; 10,000 covariances wait for their transforms. A trajectory has at most 5
+    million poses, and 4,096 bytes a line. So reading a hostile file takes at most 2 GiB of memory.
 
     If a writer has left a journal beside an SQLite file, the file is copied to a temporary folder, where SQLite undoes
     the last transaction. If the writer still runs, the original is read.

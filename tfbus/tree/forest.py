@@ -33,7 +33,7 @@ from tfbus.errors import (
 from tfbus.geometry.stamped import Batch, QualifiedTransform, TransformStamped
 from tfbus.rows import IDENTITY, Row, compose, invert
 from tfbus.stamps import LATEST, STAMP_MIN, Latest, as_stamp
-from tfbus.tree.cycles import Frames, Loop, admit, edges_above, names_below, past_loop
+from tfbus.tree.cycles import Frames, Loop, admit, past_loop
 from tfbus.tree.history import FrameHistory, Outcome, SavedFrame, clear_samples, load_frame
 from tfbus.which_kernel import Chain, Paths, commit
 
@@ -471,7 +471,7 @@ T = TypeVar("T")
 
 
 class StaticFrames:
-    """The static edges of a bus, of which none is in a loop. All forests that begin with them share their histories.
+    """The static edges of a bus, without a loop. All forests that begin with them share their histories.
 
     Attributes
     ----------
@@ -534,7 +534,8 @@ class Forest:
         By child.
     names : KnownFrames
     paths : PathCache
-        The newest paths that have been found and are permanent. A change that could make one wrong empties it.
+        The newest paths that have been found and are permanent. A change that could make one wrong empties it. Its
+        `version` is another number after each change, and its `inserted` the number of samples that were `INSERTED`.
     changing_paths : dict of (target, source) to Path
         The newest paths that have been found and are not permanent.
     changed : set of str
@@ -575,24 +576,6 @@ class Forest:
         self.looped: int = 0
         self.structure: int = 0
 
-    @property
-    def inserted(self) -> int:
-        """The number of samples that were `INSERTED`."""
-        return self.paths.inserted
-
-    @inserted.setter
-    def inserted(self, inserted: int) -> None:
-        self.paths.inserted = inserted
-
-    @property
-    def version(self) -> int:
-        """Another number after each change."""
-        return self.paths.version
-
-    @version.setter
-    def version(self, version: int) -> None:
-        self.paths.version = version
-
     # Changes
 
     def insert(self, batch: Batch) -> list[Outcome]:
@@ -607,7 +590,7 @@ class Forest:
             # The usual case: samples that only continue their histories close no loop and change no path.
             return [Outcome.INSERTED] * len(batch)
         with self.lock:
-            self.version += 1
+            self.paths.version += 1
             _, refused = admit(self.frames, batch, self.names.parents)
             if refused:
                 raise refused[0]
@@ -663,9 +646,9 @@ class Forest:
     def append(self, child: str, stamps: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> None:
         """Store the samples that `can_append` has approved; the rows have shape (n, 7)."""
         with self.lock:
-            self.version += 1
+            self.paths.version += 1
             self.frames[child].append_many(stamps, rows)
-            self.inserted += len(stamps)
+            self.paths.inserted += len(stamps)
             if self.readers:
                 self._tell_readers([child])
 
@@ -712,14 +695,14 @@ class Forest:
             If no sample names the frame.
         """
         with self.lock:
-            self.version += 1
+            self.paths.version += 1
             self.check_known(frame)
             self._remove(frame)
 
     def clear(self) -> None:
         """Drop all moving samples. Static ones and names stay."""
         with self.lock:
-            self.version += 1
+            self.paths.version += 1
             for history in clear_samples(self.frames.values()):
                 history.clear()
                 history.changed = False
@@ -730,10 +713,10 @@ class Forest:
     def share(self, static: "StaticFrames") -> None:
         """Hold the static edges of a bus; this forest is empty."""
         with self.lock:
-            self.version += 1
+            self.paths.version += 1
             self.frames.update(static.histories)
             self.names = static.names.copy()
-            self.inserted += len(static.histories)
+            self.paths.inserted += len(static.histories)
 
     def find_past_loops(self) -> None:
         """Note which of the samples since the last call are part of a loop of parents at a past stamp.
@@ -866,14 +849,6 @@ class Forest:
             if not isinstance(frame, str):
                 raise TypeError(f"a frame name must be a str, not {frame!r}")
             raise error_of(UnknownFrameError, {"frame": frame, "_known": self.names.some()})
-
-    def edges_above(self, *names: str) -> list[FrameHistory]:
-        """The edges of some frames and of all above them, by any parent that a sample in the window names."""
-        return list(edges_above(self.frames, names).values())
-
-    def names_below(self, names: Iterable[str], above: set[str]) -> set[str]:
-        """The `names` that are in `above`, or below one of these by any parent in the window."""
-        return names_below(self.frames, names, above)
 
     def read_all(self, read: Callable[[FrameHistory], T]) -> dict[str, T]:
         """The result of `read` for each frame, all of one moment.

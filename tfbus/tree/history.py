@@ -67,7 +67,7 @@ class Runs(list[tuple[int, str]]):
         return [begin for begin, _ in self[1:]]
 
     def push(self, stamp: int, name: str, newest: str) -> "Runs":
-        """The names with that of a sample newer than all others, of which the newest has the name `newest`."""
+        """The names after a sample newer than all others; the newest of those has the name `newest`."""
         if name == newest:
             return self
         runs = self or Runs([(STAMP_MIN, newest)])

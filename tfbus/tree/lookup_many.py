@@ -23,6 +23,7 @@ from tfbus.errors import DisconnectedError, TransformLookupError
 from tfbus.geometry.transform_array import TransformArray, from_columns, move
 from tfbus.rows import IDENTITY, Columns, Row, compose, invert
 from tfbus.stamps import LATEST, Latest, Stamps
+from tfbus.tree.cycles import edges_above
 from tfbus.tree.forest import Forest, Path, Step
 from tfbus.tree.history import FrameHistory, Samples
 from tfbus.tree.lookup import Policy, answer, read_stamps_at_many
@@ -186,7 +187,7 @@ def _changes(forest: Forest, target: str, source: str, path: Path | None, low: i
     """The stamps after `low`, up to `high`, at which the path may change."""
     if path is not None and path.permanent and path.root not in forest.frames:
         return []
-    edges = forest.edges_above(target, source)
+    edges = edges_above(forest.frames, (target, source)).values()
     if not any(edge.mixed for edge in edges):
         return []
     # A loop of parents has two ways round: the way whose samples cover the stamp counts.

@@ -237,7 +237,7 @@ class TransformTree:
     @property
     def inserted(self) -> int:
         """Number of samples at a new stamp."""
-        return self._forest.inserted
+        return self._forest.paths.inserted
 
     @property
     def replaced(self) -> int:
@@ -307,8 +307,8 @@ class TransformTree:
             If an edge has no sample after the stamp, or `max_gap` forbids to interpolate to it, the sample before the
             stamp stands in for some time.
         covariance : bool
-            Whether the answer is an `UncertainTransform`, which knows the covariance of its error by those that the
-            senders gave. A sample that stands in counts with its own error.
+            Whether the answer is an `UncertainTransform`, whose covariance is computed from the covariances of its
+            samples. A sample that stands in counts with its own error.
 
         Returns
         -------

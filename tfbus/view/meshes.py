@@ -210,9 +210,9 @@ def _read_mesh(path: Path) -> tuple[Triangles, tuple[int, int, int] | None]:
     elif not _is_binary(kind, data):
         _check(_numbers(data), MAX_NUMBERS, "numbers")
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=files)
-    parts = [scene.graph.get(name) for name in scene.graph.nodes_geometry[: MAX_SHAPES + 1]]
-    _check(len(parts), MAX_SHAPES, "shapes")
-    meshes = [(pose, scene.geometry[name]) for pose, name in parts]
+    nodes = scene.graph.nodes_geometry
+    _check(len(nodes), MAX_SHAPES, "shapes")
+    meshes = [(pose, scene.geometry[name]) for pose, name in map(scene.graph.get, nodes)]
     meshes = [(pose, mesh) for pose, mesh in meshes if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     _check(sum(len(mesh.vertices) for _, mesh in meshes), MAX_VERTICES, "vertices")
     if not meshes:

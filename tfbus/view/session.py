@@ -1,4 +1,4 @@
-"""The model of the page: the part that its browsers share, and the part that is of each browser.
+"""The model of the page: the part that all browsers share, and the part of each browser.
 
 A `Session` belongs to one browser. It takes the orders of a person (`read`, `do`), and `picture` gives the messages
 that bring the browser up to date. It knows no socket and no event loop, and repeats no message unless its content has
@@ -473,7 +473,7 @@ def _placed(tree: TransformTree, frame: str) -> Edit | None:
 
 
 class Session:
-    """The part of the page that is of one browser: its selection, its time, its fixed frame, its trails.
+    """The part of the page that belongs to one browser: its selection, its time, its fixed frame, its trails.
 
     Parameters
     ----------
@@ -546,7 +546,7 @@ class Session:
     def hold(self, history: TransformTree) -> None:
         """Stand still on a copy of the tree, because the live tree forgets old samples.
 
-        The stamp is the newest one that all frames cover which are not stale.
+        The stamp is the newest one that all frames cover, except stale frames.
         """
         span = span_of(forest_of(history))
         if span is not None:
@@ -676,7 +676,7 @@ class Session:
             *self._greeting(),
             *self._frames(LATEST if stamp is None else stamp, then, with_texts),
             *self._trail_lines(stamp),
-            # Changed or not, it is the sign of life that the browser waits for.
+            # It goes out unchanged too, as the sign of life that the browser waits for.
             *([self._time(now)] if with_texts or self.timeline.playing else ()),
             *(self._selection(stamp, then) if with_texts else ()),
         ]
@@ -688,7 +688,7 @@ class Session:
         if self._chosen is not None:
             self._fixed = self._chosen
         elif structure != self._structure or self._fixed is None:
-            # Only then a larger tree may have come: all frames are counted for that.
+            # Only a new structure may have a larger tree, and finding it takes a look at all frames.
             self._fixed = largest_root(forest)
         self._structure = structure
 
@@ -712,7 +712,7 @@ class Session:
     def _frames(self, at: int | Latest, then: int, with_texts: bool) -> Iterator[Message]:
         """The frames if they are others, their states if those have changed, and the poses."""
         fixed = self._fixed
-        asked = forest_of(self._tree).version, fixed, at
+        asked = forest_of(self._tree).paths.version, fixed, at
         if asked != self._asked:
             self._asked, self._poses = asked, None
             if fixed is not None:

@@ -316,7 +316,7 @@ class View(BusServer):
                 spent = time.monotonic() - begin
                 for message in messages:
                     await viewer.socket.send(message)
-                # The program has work of its own.
+                # Leave the program time for its own work.
                 await anyio.sleep(max(self._period, (2 * len(self._viewers) - 1) * spent))
                 if not viewer.session.timeline.playing:
                     with anyio.move_on_after(_AT_LEAST_EVERY):
@@ -333,7 +333,7 @@ class View(BusServer):
         self._greet()
         try:
             messages += viewer.session.picture(self.bus.clock.now(), time.monotonic_ns())
-        except Exception as error:  # noqa: BLE001 - a picture that fails must not end the program that it is of
+        except Exception as error:  # noqa: BLE001 - a picture that fails must not end the program
             self._log.warning((type(error), str(error)), "the page could not be drawn: %r", error)
         return messages
 

@@ -51,6 +51,7 @@ from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.registration import Registration
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest
 from tfbus.statistics import BufferStatistics
+from tfbus.tree.cycles import names_below
 from tfbus.tree.forest import Forest, LoopingSample
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import Policy, Question, read_stamp
@@ -577,7 +578,7 @@ class LiveTree:
             return
         if self._waiters:
             gone = {name for name in parents if name not in forest.names}
-            _wake(self.waiting.pop_asking_for(forest.names_below(self.waiting.names, {frame, *gone})))
+            _wake(self.waiting.pop_asking_for(names_below(forest.frames, self.waiting.names, {frame, *gone})))
         _wake(self.watching.mark((frame,)))
 
     def reset(self, before: int, after: int) -> None:
@@ -593,7 +594,7 @@ class LiveTree:
         forest, ahead, superseded = self.forest, self.expired_ahead, self.superseded
         expired = forest.expired + superseded
         return BufferStatistics(
-            samples, forest.inserted, forest.replaced, expired, waiting, ahead, superseded, forest.looped
+            samples, forest.paths.inserted, forest.replaced, expired, waiting, ahead, superseded, forest.looped
         )
 
     def keep_for(self, *readers: "ReadsForest") -> None:
@@ -611,7 +612,7 @@ class LiveTree:
         self._closed.clear()
         if readers:
             forest, before = self.forest.copy(), self.forest
-            forest.inserted, forest.replaced = before.inserted, before.replaced
+            forest.paths.inserted, forest.replaced = before.paths.inserted, before.replaced
             forest.expired, forest.looped = before.expired, before.looped
             for reader in readers:
                 reader._stand_on(forest)
@@ -652,7 +653,7 @@ class LiveTree:
                 _wake(self.waiting.pop_unblocked(name, None))
         if forest.changed and (self._waiters or self._watches):
             asked = {*self.waiting.names, *self.watching.changing_names}
-            concerned = forest.names_below(asked, forest.changed)
+            concerned = names_below(forest.frames, asked, forest.changed)
             _wake(self.waiting.pop_asking_for(concerned))
             _wake(self.watching.mark_asking_for(concerned))
         if self._on_loop is not None:

@@ -4,10 +4,10 @@ import os
 import anyio
 import anyio.to_thread
 import pytest
-from support.processes import free_address, new_domain, start_tfbus, until
+from support.processes import PATIENCE, free_address, new_domain, start_tfbus, until
 from support.samples import latched, moving, static
 
-from tfbus import Buffer, Bus
+from tfbus import Buffer, Bus, LocalLink
 from tfbus.links.ros.messages import as_mapping
 
 
@@ -77,20 +77,25 @@ async def test_a_bridge_between_rosbridge_and_rmw_zenoh_tells_what_is_refused_an
             assert bridge.errors.text.count("refused what peer") == 1
 
 
+@pytest.mark.anyio
 @pytest.mark.parametrize("names", [("yard", "yard"), pytest.param(("yard", "hall"), marks=pytest.mark.thorough)])
-def test_frames_pass_between_a_domain_of_this_machine_and_a_router_and_between_two_behind_it(
+async def test_frames_pass_between_a_domain_of_this_machine_and_a_router_and_between_two_behind_it(
     names: tuple[str, str],
 ) -> None:
     pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
+    from tfbus.links.zenoh import ZenohLink
+
     unique = new_domain()
     first, second = (f"{unique}-{name}" for name in names)
     address = free_address()
-    by_router = ("--connect", address)
-    with (
-        start_tfbus("bridge", first, second, "--listen", address) as bridge,
-        start_tfbus("static", "map", "base", "--domain", first, *(() if first == second else by_router)),
-        start_tfbus("static", "base", "laser", "--xyz", "1", "2", "3", "--domain", second, *by_router),
-        start_tfbus("echo", "map", "laser", "--domain", second, *by_router) as echo,
-    ):
-        assert echo.output.expect("Translation") == "- Translation: [1.000000, 2.000000, 3.000000] m"
-        assert bridge.end() == 130
+    with start_tfbus("bridge", first, second, "--listen", address) as bridge, Bus() as here, Bus() as there:
+        await anyio.to_thread.run_sync(bridge.errors.expect, "passing on")
+        near = LocalLink(here, first) if first == second else ZenohLink(here, first, connect=address)
+        async with near, ZenohLink(there, second, connect=address):
+            with Buffer(here) as buffer, Buffer(there) as other, anyio.fail_after(PATIENCE):
+                here.publish(static("map", "base", 1.0))
+                there.publish(static("base", "laser", 2.0))
+                for each in (buffer, other):
+                    found = await each.lookup("map", "laser")
+                    assert found.transform.translation == (3.0, 0.0, 0.0)
+        assert await anyio.to_thread.run_sync(bridge.end) == 130

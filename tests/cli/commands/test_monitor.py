@@ -5,7 +5,7 @@ import pytest
 from support.commands import Command
 from support.samples import moving, static
 
-from tfbus import SECOND, Bus, PeerClock
+from tfbus import SECOND, Bus, Covariance, PeerClock, Transform, UncertainSample
 from tfbus.analysis import Arrivals
 from tfbus.cli.commands.monitor import Chain, text_lines, to_document
 
@@ -45,6 +45,30 @@ def test_of_a_pair_the_way_and_its_slowest_frame_are_shown(tfbus: Command) -> No
     assert done.stdout.startswith("no transform: frame 'camra' is not known, did you mean 'camera'?\n\n")
 
 
+def test_frames_with_a_covariance_show_two_sigmas_in_their_least_sure_direction(tfbus: Command) -> None:
+    matrix = Covariance.of(rpy=(0.0, 0.0, 0.1)).matrix.copy()
+    # Equal along both axes, and 20 mm along the diagonal between them.
+    matrix[:2, :2] = [[2.5e-4, 1.5e-4], [1.5e-4, 2.5e-4]]
+    error, mount = Covariance(matrix), Covariance.of(xyz=0.6)
+
+    async def publish_errors(bus: Bus) -> None:
+        bus.publish(UncertainSample("arm", "camera", 0, Transform(), "urdf", static=True, covariance=mount))
+        async for _ in bus.clock.ticks(10.0):
+            now = bus.clock.now()
+            bus.publish(moving("map", "base", now, authority="slam"))
+            bus.publish(UncertainSample("base", "arm", now, Transform(), "joints", covariance=error))
+
+    done = tfbus.on_domain(publish_errors, "monitor", "--once", "--duration", "1.04")
+    titles, arm, base, camera = done.stdout.splitlines()
+    assert re.split("  +", titles)[:5] == ["frame", "sender", "rate", "2 sigma", "delay least"]
+    assert "40 mm, 11 deg" in arm
+    assert "deg" not in base
+    assert camera.split() == ["camera", "urdf", "static", "1.2", "m,", "0", "deg"]
+    done = tfbus.on_domain(publish_errors, "monitor", "--once", "--json", "--duration", "1.04")
+    frames = {frame["frame"]: frame.get("sigmas") for frame in json.loads(done.stdout)["frames"]}
+    assert frames == {"arm": pytest.approx(error.sigmas), "base": None, "camera": pytest.approx(mount.sigmas)}
+
+
 def test_it_is_printed_again_and_again_as_json_too(tfbus: Command) -> None:
     async def publish_for_a_while(bus: Bus) -> None:
         with bus.clock.move_on_after(2.05):
@@ -80,7 +104,7 @@ def test_peers_and_senders_whose_clocks_differ_have_tables() -> None:
         ["simulation", "31.7 years", "another clock (simulated?)"],
         ["slam", "-300 ms", "its clock is at least 300 ms ahead of this one"],
     ]
-    document = to_document(arrivals.measure(0), None, 10.0, clocks)
+    document = to_document(arrivals.measure(0), None, 10.0, clocks, {})
     assert [clock["offset"] for clock in document["clocks"]] == [0.31, None]
     assert {one["authority"]: one["delay"] for one in document["senders"]}["good"] == 0.005
 

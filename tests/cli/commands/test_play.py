@@ -42,7 +42,7 @@ def ten_seconds(tmp_path: Path) -> Path:
 @pytest.fixture
 def hour(tmp_path: Path) -> Path:
     """A message at the beginning, two after an hour, and one more after two."""
-    times = (0, 3_600, 3_601, 7_200)
+    times = [9_000 + after for after in (0, 3_600, 3_601, 7_200)]
     return write_mcap(
         tmp_path / "hour.mcap", [(k * SECOND, "/tf", [moving("map", "base", k * SECOND, float(k))]) for k in times]
     )

@@ -4,7 +4,7 @@ import sys
 import weakref
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from threading import Event
+from threading import Event, Thread
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -40,6 +40,7 @@ from tfbus.links.dds.readers import (
     delete,
     is_of_ros,
     join,
+    publication,
     read,
 )
 from tfbus.links.dds.types import RawString, RawTFMessage
@@ -55,6 +56,24 @@ def test_a_participant_of_ros_is_known_by_its_user_data(domain_number: int, user
         found = {each.key.hex: is_of_ros(each) for each in read(reader)}
         delete(reader)
         assert found == {other.id: of_ros, participant.id: False}
+
+
+def test_one_thread_at_a_time_reads_what_the_library_tells_of_others() -> None:
+    order = list[Any]()
+
+    def participants(**_: int) -> list[Any]:
+        other.start()
+        # It must not come in between.
+        other.join(0.05)
+        order.append("participants")
+        return []
+
+    writers: Any = SimpleNamespace(get_matched_publication_data=order.append)
+    other = Thread(target=publication, args=(writers, 7))
+    library: Any = SimpleNamespace(read=participants)
+    assert read(library) == []
+    other.join()
+    assert order == ["participants", 7]
 
 
 def program(name: str, of_ros: bool = True) -> Any:

@@ -332,7 +332,7 @@ async def test_a_program_that_does_not_speak_the_protocol_is_not_heard(
         async with stranger.stream:
             await stranger.say(stranger.hello("robot").replace(right, wrong, 1), channel)
             heard = await stranger.end()
-        assert (len(heard), ear.items) == (2 if channel else 0, [])
+        assert (len(heard), ear.items, len(ear.warnings)) == (2 if channel else 0, [], 1)
 
 
 async def test_a_program_on_the_loopback_that_does_not_know_the_key_is_not_heard(directory: str) -> None:

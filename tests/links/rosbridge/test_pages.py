@@ -317,6 +317,10 @@ REFUSED: dict[str, tuple[str | bytes | dict[str, Any], str]] = {
     "a huge number": ({"op": "subscribe", "topic": "/tf", "queue_length": 10**400}, "must be a number"),
     "publishing": ({"op": "publish", "topic": "/tf", "msg": {"transforms": []}}, "without publish=True"),
     "advertising": ({"op": "advertise", "topic": "tf_static"}, "without publish=True"),
+    "publishing elsewhere": (
+        {"op": "publish", "topic": "/odom", "msg": {}},
+        "nobody hears the topic '/odom'; there are",
+    ),
     "a level": ({"op": "set_level", "level": "loud"}, "not 'loud'"),
     "a goal": ({"op": "publish", "topic": "/tf2_web_republisher/goal", "msg": {"goal_id": {"id": "g"}}}, "goal must"),
     "frames": (
@@ -503,7 +507,9 @@ async def test_a_buffer_of_the_user_answers_with_what_it_has(bus: Bus) -> None:
         async with RosbridgeServer(bus, 0, buffer=buffer) as server, page_of(server) as page:
             await begin(page, "action of ROS 2", "g", goal(source_frames=["base"]))
             assert samples_of((await page.hear())["values"]) == summary(moving("map", "base", START, 1.0))
-        assert not buffer.lookup_nowait("map", "base").static
+        # It outlives the server.
+        bus.publish(moving("map", "base", START + 1, 2.0))
+        assert buffer.lookup_nowait("map", "base").stamp == START + 1
         with pytest.raises(ValueError, match="another bus"):
             RosbridgeServer(Bus(), 0, buffer=buffer)
 

@@ -10,7 +10,7 @@ from support.wires import LIVE, Ear, met
 from support.zenoh_wires import listening, start_router, talk, way_to
 
 from tfbus.links.seams import Joined, Left
-from tfbus.links.zenoh import wire
+from tfbus.links.zenoh import sessions, wire
 from tfbus.links.zenoh.neighbours import Neighbours
 from tfbus.links.zenoh.sessions import session_config
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
@@ -119,6 +119,50 @@ async def test_a_router_whose_session_breaks_at_once_says_so_at_first_and_later_
         async with listening(domain, connect=address) as one, listening(domain, connect=address) as two:
             await met(one, two)
             await talk(one, two)
+
+
+async def test_a_link_that_its_router_tells_nothing_connects_again_and_says_so(
+    address: str, domain: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As the session of a router does in which zenoh has panicked.
+    async with ZenohRouter(address), listening(domain, connect=address) as one:
+        kinds: list[Any] = [Silent]
+        monkeypatch.setattr(wire, "Neighbours", lambda session: (kinds.pop() if kinds else Neighbours)(session))
+        async with listening(domain, connect=address) as two:
+            await until(lambda: bool(two.warnings))
+            assert f"the router at {address} tells nothing, and the link connects again" in str(two.warnings[0])
+            await met(one, two)
+            await talk(one, two)
+            assert len(two.warnings) == 1
+
+
+async def test_a_router_that_gets_no_other_session_says_so_once_and_gets_one_when_it_can(
+    address: str, domain: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    opened: list[zenoh.Session] = []
+    in_use = True
+
+    def open_session(*arguments: Any) -> zenoh.Session:
+        if opened and in_use:
+            raise OSError(f"{address} is in use")
+        opened.append(sessions.open_session(*arguments))
+        return opened[-1]
+
+    kinds: list[Any] = [Silent]
+    monkeypatch.setattr(wire, "Neighbours", lambda session: (kinds.pop() if kinds else Neighbours)(session))
+    monkeypatch.setattr(wire, "open_session", open_session)
+    monkeypatch.setattr(wire, "LONGEST_CLOSE", 0.1)
+    async with ZenohRouter(address):
+        await until(lambda: bool(caplog.messages))
+        assert caplog.messages == [
+            f"this router has no session, and goes on trying; a new process would have one: {address} is in use"
+        ]
+        in_use = False
+        await until(lambda: len(opened) > 1)
+        async with listening(domain, connect=address) as one, listening(domain, connect=address) as two:
+            await met(one, two)
+            await talk(one, two)
+    assert len(caplog.messages) == 1
 
 
 class Broken(Neighbours):

@@ -1,9 +1,12 @@
 """``tfbus monitor``."""
 
 import json
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from types import MappingProxyType
 from typing import Any
 
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Positive, Rate, UsageError
@@ -12,6 +15,7 @@ from tfbus.cli.lazy_imports import lazy_imports
 from tfbus.cli.output import Column, format_span, print_now, table_lines, terminal_width, wrapped
 
 with lazy_imports():
+    import numpy as np
     from rich.text import Text
 
     from tfbus.analysis.arrivals import Arrival, Arrivals, sender_delays
@@ -19,6 +23,7 @@ with lazy_imports():
     from tfbus.bus.bus import Bus
     from tfbus.cli.tree_display import TreeDisplay
     from tfbus.errors import TransformLookupError
+    from tfbus.geometry.covariance import Covariance
     from tfbus.links.link import Link
     from tfbus.stamps import from_seconds
     from tfbus.statistics import PeerClock
@@ -38,6 +43,7 @@ _COLUMNS = (
     Column("frame"),
     Column("sender", importance=1),
     Column("rate", right=True),
+    Column("2 sigma", right=True, importance=10),
     Column("delay least", right=True, importance=2),
     Column("mean", right=True, importance=9),
     Column("p99", right=True, importance=7),
@@ -88,8 +94,10 @@ def monitor(
     A delay is the time from the stamp of a sample to its arrival here; jitter is the standard deviation of the time
     between two arrivals. A late sample has an older stamp than an earlier sample. Lost samples are counted by the gaps
     between stamps, if the sender has a fixed rate. With TARGET and SOURCE, only the frames between the two are shown,
-    and the slowest of them. A table of peers follows: how far the clock of each is ahead of this one, the bound of
-    that, its drift, and the round trip; and for senders without a measured clock, what their smallest delays tell.
+    and the slowest of them. Where samples have a covariance, "2 sigma" is twice the standard deviation of the newest
+    position and rotation, each in its least sure direction. A table of peers follows: how far the clock of each is
+    ahead of this one, the bound of that, its drift, and the round trip; and for senders without a measured clock, what
+    their smallest delays tell.
 
     Example: tfbus monitor map base_link
 
@@ -108,7 +116,8 @@ def monitor(
     duration
         With --once, how many seconds to listen first.
     as_json
-        Print a JSON object instead, one a line unless --once is given; durations in s.
+        Print a JSON object instead, one a line unless --once is given; durations in s, and sigmas as standard
+        deviations along x, y, z in m and about x, y, z in rad.
     """
     pair = None
     if target is not None:
@@ -132,12 +141,13 @@ def monitor(
                 chain = None if pair is None else chain_of(buffer.tree, *pair, found, now)
                 if chain is not None and chain.frames:
                     found = [arrival for arrival in found if arrival.frame in chain.frames]
+                errors = errors_of(buffer.tree, found)
                 clocks = [clock for each in links for clock in each.statistics().clocks]
                 if as_json:
-                    document = to_document(found, chain, window, clocks)
+                    document = to_document(found, chain, window, clocks, errors)
                     print_now(json.dumps(document, indent=2 if once else None))
                 else:
-                    lines = text_lines(found, chain, terminal_width(), clocks)
+                    lines = text_lines(found, chain, terminal_width(), clocks, errors)
                     display.show_lines([Text(line) for line in lines])
 
             await link.first_transform(bus)
@@ -165,17 +175,38 @@ def chain_of(tree: TransformTree, target: str, source: str, arrivals: Sequence[A
     return Chain(frames, slowest, None if newest is None else (now - newest) / from_seconds(1), "")
 
 
+def errors_of(tree: TransformTree, arrivals: Sequence[Arrival]) -> dict[str, Covariance]:
+    """The covariance of the newest sample of each frame that has one."""
+    errors = {}
+    for arrival in arrivals:
+        with suppress(TransformLookupError):
+            found = tree.lookup(arrival.parent, arrival.frame, covariance=True)
+            if not found.exact:
+                errors[arrival.frame] = found.covariance
+    return errors
+
+
 def to_document(
-    arrivals: Sequence[Arrival], chain: Chain | None, window: float, clocks: Sequence[PeerClock]
+    arrivals: Sequence[Arrival],
+    chain: Chain | None,
+    window: float,
+    clocks: Sequence[PeerClock],
+    errors: Mapping[str, Covariance],
 ) -> dict[str, Any]:
     """The JSON object of one update."""
     pair = {} if chain is None else {"chain": asdict(chain)}
-    frames, senders = [asdict(arrival) for arrival in arrivals], [asdict(one) for one in sender_delays(arrivals)]
+    sigmas = {frame: {"sigmas": error.sigmas.tolist()} for frame, error in errors.items()}
+    frames = [asdict(arrival) | sigmas.get(arrival.frame, {}) for arrival in arrivals]
+    senders = [asdict(one) for one in sender_delays(arrivals)]
     return {"window": window, "frames": frames, **pair, "clocks": [asdict(one) for one in clocks], "senders": senders}
 
 
 def text_lines(
-    arrivals: Sequence[Arrival], chain: Chain | None, width: int | None, clocks: Sequence[PeerClock] = ()
+    arrivals: Sequence[Arrival],
+    chain: Chain | None,
+    width: int | None,
+    clocks: Sequence[PeerClock] = (),
+    errors: Mapping[str, Covariance] = MappingProxyType({}),
 ) -> Iterator[str]:
     """The lines of one update, which fit the width."""
     if chain is not None:
@@ -184,7 +215,7 @@ def text_lines(
     if not arrivals:
         yield "(no frames)"
         return
-    yield from table_lines(_COLUMNS, [_row(arrival) for arrival in arrivals], width)
+    yield from table_lines(_COLUMNS, [_row(arrival, errors.get(arrival.frame)) for arrival in arrivals], width)
     if any(clock.offset is not None for clock in clocks):
         yield ""
         yield from table_lines(_CLOCK_COLUMNS, [_clock_row(clock) for clock in clocks], width)
@@ -217,7 +248,15 @@ def _clock_row(clock: PeerClock) -> tuple[str, ...]:
     )
 
 
-def _row(arrival: Arrival) -> tuple[str, ...]:
+def _size(error: Covariance) -> str:
+    """Two standard deviations of the position and of the rotation, each in its least sure direction."""
+    halves = error.matrix[:3, :3], error.matrix[3:, 3:]
+    place, turn = (2.0 * math.sqrt(max(np.linalg.eigvalsh(half)[-1], 0.0)) for half in halves)
+    length = f"{place * 1e3:.3g} mm" if place < 0.9995 else f"{place:.3g} m"
+    return f"{length}, {math.degrees(turn):.2g} deg"
+
+
+def _row(arrival: Arrival, error: Covariance | None) -> tuple[str, ...]:
     rate = "" if arrival.rate is None else f"{arrival.rate:.1f} Hz"
     state = "static" if arrival.static else "silent" if not arrival.samples else rate or "one sample"
     counted = not arrival.static
@@ -225,6 +264,7 @@ def _row(arrival: Arrival) -> tuple[str, ...]:
         arrival.frame,
         arrival.authority,
         state,
+        "" if error is None else _size(error),
         format_span(arrival.delay_min),
         format_span(arrival.delay_mean),
         format_span(arrival.delay_p99),

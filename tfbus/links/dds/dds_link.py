@@ -47,6 +47,7 @@ from tfbus.links.dds.readers import (
     join,
     name_of,
     program,
+    publication,
     read,
 )
 from tfbus.links.dds.types import (
@@ -367,7 +368,7 @@ class DdsCarrier(RosCarrier):
     def _publication(self, reader: DataReader[RawTFMessage], handle: int) -> Any:
         """The data that the library has of a writer; None if it has gone since, or the library cannot read it."""
         try:
-            return reader.get_matched_publication_data(handle)
+            return publication(reader, handle)
         except UnicodeDecodeError as error:
             # A stranger has given the writer such a name.
             self._failed(error)

@@ -2,8 +2,8 @@
 
 As soon as a participant of Fast DDS hears of another one, it tells of its writers, and as soon as it hears of a reader,
 it sends what is latched. Cyclone DDS drops both while it does not know their sender, and Fast DDS repeats them only
-with its next heartbeat, after 3 s. So in `join`, a participant without readers makes itself heard first. When those who
-answer are known, a second one joins, to which all is told once more; and it gets its readers when it knows the writers.
+with its next heartbeat, after 3 s. So in `join`, a participant without readers makes itself heard first. When it knows
+the others, a second one joins, which all tell once more of themselves; it gets its readers when it knows the writers.
 The writers of a program that comes later meet readers which are there already: `Greeting` is for these.
 
 `ReaderThread` waits for all readers in one thread, without listeners. The library calls a listener while it keeps its
@@ -42,7 +42,7 @@ WRITERS_TIME = 1.5
 GREETING_TIME = 0.5
 """s; for so long there is a second reader, which new writers greet."""
 _READING = Lock()
-"""The library converts settings by memory that all threads share, and two threads would free it twice."""
+"""The library reads the settings of others by memory that all threads share, and two threads would free it twice."""
 _PERIOD = 0.002
 _MOST = 10_000
 _LONGEST_NAME = 256
@@ -89,6 +89,18 @@ def read(reader: BuiltinDataReader) -> list[Any]:
     return [each for each in found if not isinstance(each, InvalidSample)]
 
 
+def publication(reader: DataReader[Any], handle: int) -> Any:
+    """All that the library tells of a writer that a reader is matched with; None if it has gone since.
+
+    Raises
+    ------
+    UnicodeDecodeError
+        If a name of it is no text.
+    """
+    with _READING:
+        return reader.get_matched_publication_data(handle)
+
+
 def name_of(participant: Any) -> str:
     """The name of a participant, as the library tells of it; empty if it has none."""
     name: str = participant.qos[Policy.EntityName].name if Policy.EntityName in participant.qos else ""
@@ -106,7 +118,7 @@ class Greeting:
 
     A writer greets a new reader: its heartbeat tells where its messages begin. Fast DDS does so once, as soon as it has
     heard of the reader, and Cyclone DDS often does not know the writer by then. Then the next heartbeat counts as the
-    greeting, and what came before it is dropped unless it is whole; Fast DDS sends that heartbeat between the parts of
+    greeting, and earlier messages are dropped unless they are whole; Fast DDS sends that heartbeat between the parts of
     the first large message. A second reader has the writer greet once more, and that counts for all readers of the
     participant.
 

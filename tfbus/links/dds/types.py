@@ -1,7 +1,7 @@
 """The types of ROS 2 that go over DDS, by the names that ROS 2 gives them.
 
 Links send and hear bytes: `tfbus.tf_message` reads and writes them many times faster than the library does. The fields
-that are declared here are for others, to whom DDS tells the type.
+that are declared here are for other programs, which DDS tells the type.
 """
 
 import struct

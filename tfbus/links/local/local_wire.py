@@ -19,8 +19,8 @@ The side that has connected says hello first. The other side answers with hello 
 its welcome. A connection is *met* for a side when it has both, so nothing that is sent after `Joined` can come too
 early. For Unix sockets the key is zeros, and the kernel tells the user of the other process. On the loopback the key
 stands in the file that names the port; the side that has connected says the first half, and the side that listens
-answers with the second. So a program at a port of which the link has gone learns only a half that nobody asks for any
-more, and cannot answer.
+answers with the second. So a program that listens at the port of a link that has gone learns only a half that nobody
+asks for any more, and cannot answer.
 
 Connecting
 ----------
@@ -106,7 +106,7 @@ class LocalWire(Wire):
             domain, self.id, directory, not hasattr(socket, "AF_UNIX") if loopback is None else loopback
         )
         self._listener: socket.socket | None = None
-        # All of them, the oldest first; and those that are met, by the ids of the other links.
+        # All connections, the oldest first; and the met ones, by the ids of the other links.
         self._connections: dict[Connection, None] = {}
         self._links: dict[str, Connection] = {}
         self._budget = TurnBudget()

@@ -91,7 +91,7 @@ class MeetingPlace:
     name : str
         The name of the link's file; empty unless it is open. A younger link has a greater one.
     key : bytes
-        Known to those who may read the file; zeros for Unix sockets, where the kernel tells who connects.
+        The users who may read the file know it; zeros for Unix sockets, where the kernel tells who connects.
     """
 
     def __init__(self, domain: str, link: str, directory: str | None, loopback: bool) -> None:

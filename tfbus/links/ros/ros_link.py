@@ -244,7 +244,7 @@ class RosLink(Link):
         Connects to ROS.
     tf, tf_static : str or iterable of str
         The topics of the moving and of the static frames, by default ``/tf`` and ``/tf_static``. If there are several,
-        all are heard, and what goes out goes to the first.
+        all are heard, and the link publishes on the first.
     prefix : str, optional
         Put before each name that comes from ROS, such as ``"robot1/"``, and taken off each name that goes there. Frames
         of the bus without it do not go there.

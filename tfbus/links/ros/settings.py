@@ -163,7 +163,7 @@ class RosSettings:
     Attributes
     ----------
     tf, tf_static : tuple of str
-        The topics that are heard; what goes out goes to the first.
+        The topics that are heard; the link publishes on the first.
     names : FrameNames
     send : bool
         Whether anything goes out.

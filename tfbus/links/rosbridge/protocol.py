@@ -86,7 +86,7 @@ def subscribe(topic: str, encoding: str, type_: str = TYPE) -> str:
 
 
 def unsubscribe(topic: str) -> str:
-    """The end of that."""
+    """The request for no more messages of a topic."""
     return _request("unsubscribe", topic)
 
 
@@ -112,7 +112,7 @@ def read(message: str | bytes) -> Incoming:
     """
     try:
         content = json.loads(message) if isinstance(message, str) else _loads(message)
-    # Of a deep or a huge one, the two raise whatever they like.
+    # For deep or huge messages, the two decoders raise errors of several kinds.
     except Exception as error:  # noqa: BLE001
         raise MalformedMessageError("encoding", f"it is neither JSON nor CBOR: {error!r}"[:200]) from None
     return _incoming(content, isinstance(message, str))
@@ -332,7 +332,7 @@ class _Cbor:
             yield name
 
     def _head(self) -> int:
-        """The length of what comes next (RFC 8949, section 3)."""
+        """The length of the next item (RFC 8949, section 3)."""
         info = self._data[self._at] & 31
         self._at += 1
         if info < 24:

@@ -1,16 +1,17 @@
 """`RosbridgeLink`: the transforms of ROS 1 or ROS 2 on a bus, and those of the bus there, through a rosbridge server.
 
 `RosbridgeCarrier` holds one connection at a time, and a few tasks for as long as it lasts: one reads, one writes what
-waits, one pings, and three work around what servers do. When the first of them fails, all end, the peer is lost, and
+waits, one pings, and three work around faults of servers. When the first of them fails, all end, the peer is lost, and
 the carrier connects again. All runs in the event loop, and all times are those of its clock.
 
 Texts wait in three places to be written. Requests go first, in their order. Of the static frames only the newest
 message waits, because each holds all of them. Moving frames are a queue whose oldest give way.
 
-A server tells nobody what it refuses: rosbridge_suite writes it to its own log, and then a static frame never arrives.
-One of ROS 2 does so once its logger has failed, for the next client that advertises a topic whose last client has just
-left; it forgets that topic after ten seconds. But a server gives its clients back what they publish on a topic to which
-they subscribe. So `Confirmation` compares what comes with what was sent, and what does not come back was not taken.
+A server tells nobody about a message that it refuses: rosbridge_suite writes that to its own log, and then a static
+frame never arrives. A server of ROS 2 whose logger has failed refuses the next client that advertises a topic whose
+last client has just left; it forgets that topic after ten seconds. But a server sends a client its own messages back,
+if the client subscribes to their topic. So `Confirmation` compares the static frames that come with those that were
+sent; a frame that does not come back was refused.
 
 A server of ROS 2 subscribes to a topic as it finds publishers there, and its own are latched: a subscription that meets
 one of them never hears the nodes of ROS. It keeps the publisher of a client that has gone for ten seconds. So after a
@@ -85,11 +86,11 @@ class Confirmation:
         self.doubted: bool = False
 
     def expect(self, samples: Sequence[TransformStamped]) -> None:
-        """All static frames, which are published now, have to come back."""
+        """Expect all static frames back, which are published now."""
         self._missing = {sample.child: sample for sample in samples}
 
     def sent(self) -> None:
-        """The message with them is on its way."""
+        """Note that the message with the static frames has been sent."""
         self._sent.set()
 
     def heard(self, samples: Sequence[TransformStamped | None]) -> None:
@@ -106,7 +107,7 @@ class Confirmation:
             self._complete.set()
 
     async def run(self, report: SendReport) -> None:
-        """Have published again what does not come back, and report it, until cancelled."""
+        """Publish the static frames again that do not come back, and report them, until cancelled."""
         pause, told = CONFIRM_TIME, False
         while True:
             await self._sent.wait()

@@ -1,7 +1,7 @@
 """`RosbridgeServer`: to web pages, a bus looks like ROS behind a rosbridge server with a tf2_web_republisher.
 
-Each page is one `_Page`, which owns all that was asked for by it: when the page goes, all of that ends. One task reads
-its requests, another writes what goes out, so that a message leaves whole even if its subscription ends meanwhile.
+Each page is one `_Page`, which owns the work that the page asked for, and ends it when the page goes. One task reads
+its requests, another writes messages, so that a message leaves whole even if its subscription ends meanwhile.
 Every subscription and every republication is a task of its own between the two. It hands over one message at a time,
 and takes the newest state of the bus when the page has read that one: a slow page skips, and nobody waits for it.
 
@@ -206,7 +206,7 @@ class _Republication(NamedTuple):
 Say = Callable[[Sequence[TransformStamped]], Awaitable[None]]
 
 
-class _Wish(NamedTuple):
+class _Subscription(NamedTuple):
     """A subscription.
 
     Attributes
@@ -233,7 +233,7 @@ class _Page:
         self._server = server
         self._socket = socket
         self._level = _LEVELS.index("warning")
-        self._wishes: dict[str, dict[str | int | None, _Wish]] = {}
+        self._subscriptions: dict[str, dict[str | int | None, _Subscription]] = {}
         self._named: dict[str, _Republication] = {}
         self._names = count()
         self._published: set[str] = set()
@@ -276,10 +276,10 @@ class _Page:
 
     async def _send_message(self, topic: str, message: dict[str, Any], transforms: Sequence[TransformStamped]) -> None:
         """Send a message of some transforms to the subscriptions of a topic."""
-        wishes = list(self._wishes.get(topic, {}).values())
-        for name in dict.fromkeys(wish.name for wish in wishes):
+        subscriptions = list(self._subscriptions.get(topic, {}).values())
+        for name in dict.fromkeys(subscription.name for subscription in subscriptions):
             envelope = {"op": "publish", "topic": name, "msg": message}
-            compression = max((wish.compression for wish in wishes), key=_COMPRESSIONS.index)
+            compression = max((subscription.compression for subscription in subscriptions), key=_COMPRESSIONS.index)
             if compression == "none":
                 await self._send(envelope)
                 continue
@@ -344,28 +344,28 @@ class _Page:
         if request.get("fragment_size") is not None:
             await self._tell("warning", "fragments are not offered: messages come whole", request)
         period = min(_number(request, "throttle_rate", 0.0) / 1_000.0, _LONGEST_PERIOD)
-        wish = _Wish(request["topic"], period, int(_number(request, "queue_length", 0.0)), compression)
-        wishes = self._wishes.setdefault(topic, {})
-        if id_ not in wishes and len(wishes) == MOST_REQUESTS:
+        subscription = _Subscription(request["topic"], period, int(_number(request, "queue_length", 0.0)), compression)
+        subscriptions = self._subscriptions.setdefault(topic, {})
+        if id_ not in subscriptions and len(subscriptions) == MOST_REQUESTS:
             raise _RefusedRequest(f"{topic!r} has {MOST_REQUESTS} subscriptions already")
-        wishes[id_] = wish
+        subscriptions[id_] = subscription
         self._follow(topic)
 
     async def _unsubscribe(self, request: dict[str, Any]) -> None:
         topic = _topic(request)
-        wishes = self._wishes.get(topic, {})
+        subscriptions = self._subscriptions.get(topic, {})
         if "id" in request:
-            wishes.pop(_id_of(request).get("id"), None)
+            subscriptions.pop(_id_of(request).get("id"), None)
         else:
-            wishes.clear()
-        if wishes:
+            subscriptions.clear()
+        if subscriptions:
             self._follow(topic)
         else:
-            self._wishes.pop(topic, None)
+            self._subscriptions.pop(topic, None)
             self._stop(topic)
 
     def _follow(self, topic: str) -> None:
-        """Begin to send a topic as all its subscriptions together want it, with all that is latched."""
+        """Begin to send a topic as all its subscriptions together want it, latched samples first."""
         if topic == _FEEDBACK:
             self._hears_feedback.set()
         elif topic in _TOPICS:
@@ -502,8 +502,11 @@ class _Page:
             scope.cancel()
 
     async def _send_topic(self, topic: str) -> None:
-        wishes = self._wishes[topic].values()
-        period, length = min(wish.period for wish in wishes), min(wish.length for wish in wishes)
+        subscriptions = self._subscriptions[topic].values()
+        period, length = (
+            min(subscription.period for subscription in subscriptions),
+            min(subscription.length for subscription in subscriptions),
+        )
         server, static = self._server, _TOPICS[topic]
         newest_only = period > 0.0 and not length
         capacity = MOST_CONFLATED if newest_only else min(length or MOST_WAITING, MOST_WAITING)
@@ -564,7 +567,7 @@ def _request_of(text: str | bytes) -> dict[str, Any]:
         raise _RefusedRequest("requests are in JSON here, not in bytes")
     try:
         request = json.loads(text)
-    # Of a deep or a huge one, the parser raises whatever it likes.
+    # For deep or huge requests, the parser raises errors of several kinds.
     except Exception as error:  # noqa: BLE001
         raise _RefusedRequest(f"a request is no JSON: {error}") from None
     return _fields(request, "request")

@@ -1,4 +1,4 @@
-"""The case in which a router is connected to another one and is told nothing by it.
+"""The case in which a router is connected to another one, or a link to its router, and is told nothing by it.
 
 Connected zenoh routers tell each other once, when a connection begins, what their clients declare: subscribers and
 tokens. Two defects of zenoh 1.10 lose that, until the connection breaks again. In both, one router is told too little,
@@ -13,6 +13,10 @@ and keeps what it was told before: links that have gone stay present, and others
 So each router of tfbus has an id that shows that it is one, and a token. A router that is connected without its token
 is one of these cases, because zenoh tells tokens and subscribers by the same way. The cure is a new session with
 another id, which is a new router to all others: it is told everything. Its clients connect again, as after any break.
+
+A link is told nothing if it has connected while the session of the router closed: zenoh 1.10 panics then if it is asked
+for tokens, keeps the connection, and reads nothing from it. So a link waits for the token of its router too, and the
+cure is the same.
 
 Nothing here heals a third defect, of routers in a ring. A token that ends within some ms of the break of a connection
 is not taken back at its other end, because the first router finds no connection any more, and those around do not pass
@@ -46,7 +50,7 @@ def new_id() -> str:
 
 
 class Neighbours:
-    """The other routers of tfbus that the session of a router is connected to.
+    """The routers of tfbus that a session is connected to.
 
     Attributes
     ----------
@@ -62,11 +66,12 @@ class Neighbours:
         # Since when each router is connected without its token.
         self._silent: dict[str, float] = {}
         take = zenoh.handlers.Callback(self._take, indirect=False)
-        liveliness = session.liveliness()
-        self.declared: list[Any] = [
-            liveliness.declare_subscriber(f"{_TOKENS}*", take, history=True),
-            liveliness.declare_token(f"{_TOKENS}{self._info.zid()}"),
-        ]
+        self._liveliness = session.liveliness()
+        self.declared: list[Any] = [self._liveliness.declare_subscriber(f"{_TOKENS}*", take, history=True)]
+
+    def announce(self) -> None:
+        """Tell others that this session is a router too."""
+        self.declared.append(self._liveliness.declare_token(f"{_TOKENS}{self._info.zid()}"))
 
     def are_silent(self, now: float) -> bool:
         """Whether one of them has been connected too long without its token; to be called every `PERIOD`."""

@@ -10,7 +10,7 @@ Keys, where *robot* is ``~`` for a link without one, *link* is 32 hexadecimal di
 
 Connecting: a link dials a router, the first of its addresses that answers within `OPENING_TIME`. Links never dial each
 other. With ``listen`` a link's own session is a router; it dials the other routers, and breaks only if one of these
-tells it nothing (see `tfbus.links.zenoh.neighbours`).
+tells it nothing. So does the session of a client whose router tells it nothing (see `tfbus.links.zenoh.neighbours`).
 
 Present: a link is present while the token of its newest known session is seen. A new session of a present link is told
 as `Left` and `Joined`, because messages may have been lost between them. The token of an older session means nothing
@@ -51,6 +51,7 @@ from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
 from tfbus.links.zenoh.neighbours import PAUSE_TO_BEGIN, PAUSE_TO_LISTEN, PERIOD, Neighbours, new_id
 from tfbus.links.zenoh.sessions import (
     CLOSING_TIME,
+    LONGEST_CLOSE,
     LONGEST_NAME,
     THREAD,
     Addresses,
@@ -199,7 +200,8 @@ class ZenohWire(Wire):
     def _tell(self) -> None:
         """Let `open` return, and warn; on the event loop."""
         self._tried.set()
-        if not self._is_router and not self._stopped and self._failure is not None:
+        # The first failure of a router is raised by `open`.
+        if not (self._is_router and self._sessions == 1) and not self._stopped and self._failure is not None:
             failure, self._failure = self._failure, None
             self._warn(failure)
 
@@ -221,34 +223,42 @@ class ZenohWire(Wire):
             begin_to_close(session)
             if self._is_router:
                 sleep(PAUSE_TO_BEGIN)
+            elif not session.broken:
+                where = self._addresses[0]
+                why = "its session may be closing, or its access rules stop tokens on tfbus/@router/*"
+                self._failure = OSError(f"the router at {where} tells nothing, and the link connects again: {why}")
+                self._wake()
             self._addresses.rotate(-1)
 
     def _connect(self, channels: Iterable[str]) -> "_Session | None":
         """Try one router after the other until one answers; None if the wire is closed, or cannot listen."""
-        warns_at = monotonic() + FIRST_WAIT
+        warns_at = monotonic() + (LONGEST_CLOSE if self._is_router else FIRST_WAIT)
         while not self._stopped:
             try:
                 return self._connect_once(channels)
             except OSError as error:
                 failure = error
             self._addresses.rotate(-1)
-            if self._is_router:
-                if self._sessions == 1:
-                    self._failure = failure
-                    self._wake()
-                    return None
-                # The session before may not have freed the address yet.
-                self._wait(PAUSE_TO_LISTEN)
-                continue
+            if self._is_router and self._sessions == 1:
+                self._failure = failure
+                self._wake()
+                return None
             if monotonic() > warns_at:
                 warns_at = math.inf
-                where = ", ".join(sorted(self._addresses))
-                # zenoh's usual error names the addresses once more, and no reason.
-                why = "" if "Unable to connect to any of" in str(failure) else f": {failure}"
-                self._failure = OSError(f"no router answers at {where}, and the link goes on trying{why}")
+                self._failure = self._lasting(failure)
                 self._wake()
-            self._wait(uniform(*PAUSE) / len(self._addresses))
+            # The session of a router before this one may not have freed the address yet.
+            self._wait(PAUSE_TO_LISTEN if self._is_router else uniform(*PAUSE) / len(self._addresses))
         return None
+
+    def _lasting(self, failure: OSError) -> OSError:
+        if self._is_router:
+            # zenoh may never end a session in which it has panicked.
+            return OSError(f"this router has no session, and goes on trying; a new process would have one: {failure}")
+        where = ", ".join(sorted(self._addresses))
+        # zenoh's usual error names the addresses once more, and no reason.
+        why = "" if "Unable to connect to any of" in str(failure) else f": {failure}"
+        return OSError(f"no router answers at {where}, and the link goes on trying{why}")
 
     def _connect_once(self, channels: Iterable[str]) -> "_Session":
         self._sessions += 1
@@ -297,7 +307,7 @@ class _Session:
         self._publishing = threading.Lock()
         self._declared: list[object] = []
         self._neighbours: Neighbours | None = None
-        self._broken = False
+        self.broken = False
         self._lock = threading.Lock()
         self._ended = False
         # The number of the newest session of each link that is present, and which of the wire's `hears` is for it.
@@ -310,11 +320,12 @@ class _Session:
     def begin(self, number: int, *, is_router: bool) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
         session, wire, declared = self._session, self._wire, self._declared
-        if is_router:
-            self._neighbours = Neighbours(session)
-            declared += self._neighbours.declared
-        else:
+        if not is_router:
             declared.append(session.info.declare_transport_events_listener(_directly(self._take_event)))
+        self._neighbours = Neighbours(session)
+        if is_router:
+            self._neighbours.announce()
+        declared += self._neighbours.declared
         for index, (robots, channel) in enumerate(wire.hears):
             take = _directly(partial(self._take_published, index))
             key = f"{wire.domain}/{robots_expression(robots)}/{channel}/*"
@@ -329,11 +340,11 @@ class _Session:
         declared.append(liveliness.declare_token(f"{wire.own}/@alive/{wire.id}/{number}"))
         if not is_router and not session.info.transports():
             # It broke before anybody listened.
-            self._broken = True
+            self.broken = True
 
     def look(self, now: float) -> float | None:
         """Tell of the links that have left by now; the s until the next look, or None to have another session."""
-        if self._broken or (self._neighbours is not None and self._neighbours.are_silent(now)):
+        if self.broken or (self._neighbours is not None and self._neighbours.are_silent(now)):
             return None
         with self._lock:
             for link in [link for link, due in self._leaving.items() if due <= now]:
@@ -442,7 +453,7 @@ class _Session:
 
     def _take_event(self, event: zenoh.TransportEvent) -> None:
         if event.kind == zenoh.SampleKind.DELETE:
-            self._broken = True
+            self.broken = True
             self._wire.changed.set()
 
     def _leave(self, link: str) -> None:

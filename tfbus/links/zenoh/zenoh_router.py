@@ -1,5 +1,7 @@
 """A zenoh router in this process, which links and other routers connect to."""
 
+import logging
+from functools import partial
 from types import TracebackType
 from typing import Final, Self
 
@@ -57,7 +59,7 @@ class ZenohRouter(AsyncOnly):
     async def __aenter__(self) -> Self:
         self._enter_once()
         try:
-            await self._wire.open((), lambda *_: None, lambda _: None)
+            await self._wire.open((), lambda *_: None, partial(logging.getLogger("tfbus").warning, "%s"))
         except BaseException:
             await self._wire.close()
             raise

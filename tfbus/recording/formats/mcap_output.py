@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from io import FileIO
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from stat import S_ISREG
 from typing import Any, cast
@@ -21,6 +22,13 @@ from typing import Any, cast
 from tfbus.bus.queues import TimedBatch
 from tfbus.errors import InvalidTransformError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.recording.formats.covariances import (
+    MAX_COVARIANCES,
+    SUFFIX,
+    covariance_channel,
+    covariances_of,
+    write_covariances,
+)
 from tfbus.recording.formats.storage import AUTHORITIES
 from tfbus.tf_message import encode, refusal
 
@@ -110,6 +118,7 @@ SCHEMA = _SEPARATOR.join(
     )
 )
 
+_is_plain = attrgetter("_is_plain")
 _BURST = 16
 _PAUSE = 1e-5
 
@@ -165,6 +174,7 @@ class McapOutput:
             raise
         schema = writer.register_schema(SCHEMA_NAME, "ros2msg", SCHEMA.encode())
         self._channels = Channels(lambda topic, metadata: writer.register_channel(topic, "cdr", schema, metadata))
+        self._covariances: dict[str, int] = {}
         self._written = self._file.size
 
     def write(self, batches: Iterable[TimedBatch], flush: bool = False) -> None:
@@ -212,6 +222,11 @@ class McapOutput:
         self._file.close()
 
     def _write(self, topic: str, received: int, samples: Sequence[TransformStamped]) -> None:
+        uncertain = not all(map(_is_plain, samples))
+        if uncertain and len(samples) > MAX_COVARIANCES:
+            for first in range(0, len(samples), MAX_COVARIANCES):
+                self._write(topic, received, samples[first : first + MAX_COVARIANCES])
+            return
         try:
             data = encode(samples)
         except InvalidTransformError:
@@ -232,12 +247,25 @@ class McapOutput:
             self.unattributed += len(samples)
         # The format has no time before 1970.
         log_time = max(0, received)
+        if uncertain:
+            self._write_covariances(topic + SUFFIX, log_time, samples)
         # Registering the channel may have ended the chunk.
         self._count_written()
         self.buffered += len(samples)
         self._buffered_messages += 1
         self._writer.add_message(channel, log_time, data, log_time)
         self._count_written()
+
+    def _write_covariances(self, topic: str, log_time: int, samples: Sequence[TransformStamped]) -> None:
+        covariances = covariances_of(samples)
+        if not covariances:
+            return
+        if topic not in self._covariances:
+            profiles = {"offered_qos_profiles": _quality_of_service(static="static" in topic)}
+            channel = covariance_channel(topic, profiles)
+            schema = self._writer.register_schema(channel.type, channel.schema_encoding, channel.schema)
+            self._covariances[topic] = self._writer.register_channel(topic, channel.encoding, schema, profiles)
+        self._writer.add_message(self._covariances[topic], log_time, write_covariances(covariances), log_time)
 
     def _check_file(self) -> None:
         """Raise `OSError` if the file lacks data that were written, and count their samples as not written."""

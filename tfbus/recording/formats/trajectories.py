@@ -22,6 +22,7 @@ import numpy as np
 from tfbus.errors import InvalidTransformError, RecordingError
 from tfbus.geometry.transform import Transform
 from tfbus.recording.formats.copies import CannotWriteError
+from tfbus.recording.formats.covariances import holds_covariances
 from tfbus.recording.formats.storage import (
     Channel,
     Packed,
@@ -312,6 +313,8 @@ class TrajectoryCopy:
         """Write the poses of a message; raises `CannotWriteError` for anything else."""
         if not holds_transforms(channel) or channel.topic.endswith("_static"):
             what = "static frames" if holds_transforms(channel) else "other topics"
+            if holds_covariances(channel):
+                what = "covariances"
             raise CannotWriteError(f"a trajectory has no {what}")
         for raw in parser_of(channel)(payload):
             self._edges.setdefault((raw.parent, raw.child))
