@@ -15,7 +15,7 @@ from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
 from tfbus.links.clocks import Clocks
 from tfbus.links.endpoint import MAX_PEERS, Endpoint, HearsTime
 from tfbus.links.history import LONGEST_HISTORY, HistoryAsker, chunk_of_past
-from tfbus.links.lookups import BufferServer, RemoteLookups
+from tfbus.links.lookups import RemoteLookups
 from tfbus.links.message import (
     END_OF_STAMPS,
     FIRST_STAMP,
@@ -229,11 +229,6 @@ class DomainEnd(Endpoint):
         """Sign so many seconds after the last sign, or in the next turn of the event loop, if no sign is due before."""
         self._sign_due = min(self._sign_due, self._signed_at + seconds)
         self.host.stir()
-
-    def serve(self, server: BufferServer | None) -> None:
-        """Serve a buffer, or none any more."""
-        self.lookups.server = server
-        self.sign_soon()
 
     def clock_statistics(self) -> tuple[PeerClock, ...]:
         return self.clocks.statistics((link, self.peers[link].authorities) for link in self.present)

@@ -523,7 +523,8 @@ class DomainLink(Link):
 
     def serve(self, server: BufferServer | None) -> None:
         """Say to all peers whether this link serves a buffer. Called by a `BufferServer`."""
-        self._domain_end.serve(server)
+        self._domain_end.lookups.server = server
+        self._domain_end.sign_soon()
 
     @overload
     async def lookup(

@@ -378,8 +378,6 @@ class BufferServer(AsyncOnly):
 
     async def _wait(self, key: tuple[str, int], question: RemoteQuestion, scope: anyio.CancelScope) -> None:
         answer: TransformStamped | Exception | None = None
-        if scope.cancel_called:
-            return
         with scope:
             try:
                 # Not a number is not less either.
