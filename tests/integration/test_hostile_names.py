@@ -381,8 +381,14 @@ def filled(arguments: Sequence[object], file: Path, names: Sequence[str]) -> lis
     return [places.get(argument, argument) for argument in arguments]
 
 
-@pytest.mark.parametrize("columns", ["", "40"])
-@pytest.mark.parametrize("arguments", OF_FILE.values(), ids=OF_FILE)
+IN_COLUMNS = [
+    pytest.param(arguments, columns, marks=pytest.mark.thorough if columns and name != "info" else ())
+    for name, arguments in OF_FILE.items()
+    for columns in ("", "40")
+]
+
+
+@pytest.mark.parametrize(("arguments", "columns"), IN_COLUMNS)
 def test_no_command_prints_a_name_of_a_file_as_it_is(
     recording: Path,
     plain_recording: Path,
