@@ -167,7 +167,17 @@ async def test_a_recording_with_a_slow_stream_is_read_to_its_end(capacity: int) 
 
 
 async def test_a_recording_is_not_read_faster_than_its_sets() -> None:
-    async with Synchronizer(replay(range(500)), replay(range(500)), within=0.0, capacity=3, block=True) as sets:
+    read = 0
+
+    async def counted() -> AsyncIterator[Message]:
+        nonlocal read
+        async for message in replay(range(500)):
+            read += 1
+            yield message
+
+    async with Synchronizer(counted(), replay(range(500)), within=0.0, capacity=3, block=True) as sets:
+        await anyio.wait_all_tasks_blocked()
+        assert read <= 2 * 3
         assert [messages[0].stamp async for messages in sets] == list(range(500))
     assert not any(sum(counts.values()) for counts in sets.dropped)
 

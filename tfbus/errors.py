@@ -626,9 +626,9 @@ class RecordingError(TransformError, ValueError):
     path: str
     reason: str
 
-    def __init__(self, problem: str, *, path: str, reason: str) -> None:
+    def __init__(self, problem: str, *, path: str, reason: str, kind: str = "recording") -> None:
         # Messages of other packages may have several lines.
-        super().__init__(f"recording {path!r}: {' '.join(problem.split()).rstrip('.')}")
+        super().__init__(f"{kind} {path!r}: {' '.join(problem.split()).rstrip('.')}")
         self.path = path
         self.reason = reason
 
@@ -636,8 +636,8 @@ class RecordingError(TransformError, ValueError):
 class MissingRecordingError(RecordingError, FileNotFoundError):
     """There is no file of this name; as with other files, ``except FileNotFoundError`` catches it."""
 
-    def __init__(self, *, path: str) -> None:
-        super().__init__("there is no such file", path=path, reason="missing")
+    def __init__(self, *, path: str, kind: str = "recording") -> None:
+        super().__init__("there is no such file", path=path, reason="missing", kind=kind)
 
 
 class ClockResetError(TransformError):

@@ -247,7 +247,7 @@ def test_rooms_and_commands_without_their_extras_name_them(tmp_path: Path) -> No
     for line, (need, _, extras) in zip(told, (text.partition("|") for text in expected), strict=True):
         assert line.startswith(f'tfbus: {need}pip install "tfbus[{extras}]"')
     for line, extra in zip(done.stdout.splitlines(), rooms.values(), strict=True):
-        assert f'pip install "tfbus[{extra}]"' in line
+        assert f'pip install "tfbus[{extra}]", or ".[{extra}]" in a checkout' in line
 
 
 @pytest.mark.thorough
@@ -305,6 +305,10 @@ def test_the_help_of_a_command_has_an_example_and_defaults_and_loads_none_of_its
     helps, loaded, at = json.loads(done.stdout)
     for command, text in helps.items():
         assert f"Example: tfbus {command}" in text
+        arguments = re.findall(r"│ [* ]? *([A-Z]+)  ", text)
+        usage = re.fullmatch(rf"Usage: tfbus {command} \[OPTIONS\](.*)", text.splitlines()[0])
+        assert usage is not None, command
+        assert re.findall("[A-Z]+", usage[1]) == arguments, command
         # Neither `--no-json` nor `--empty-listen`: the options that cyclopts adds by itself mean nothing here.
         no = ["--no-broadcaster"] if command == "demo" else []
         assert re.findall(r"--(?:no|empty)-\w+", text) == no, command

@@ -30,6 +30,7 @@ from tfbus import (
     Bus,
     Edge,
     Event,
+    ExtrapolationError,
     InvalidTransformError,
     PointStamped,
     SimulatedClock,
@@ -110,6 +111,8 @@ def test_every_error_is_one_line(kind: type[TransformError]) -> None:
         facts = {fact: value_of(hint, name) for fact, hint in get_type_hints(kind).items() if fact[0] != "_"}
         if kind is UnknownFrameError:
             facts["close_matches"] = [name]
+        if issubclass(kind, ExtrapolationError):
+            facts["clock"] = name
         cause = UnknownFrameError(frame=name, known=(name + "x",)).to_dict()
         data = {"type": kind.__name__, "message": name, **facts, "cause": cause}
         error = kind.from_dict(json.loads(json.dumps(data, default=lambda value: value.value)))
@@ -378,8 +381,14 @@ def filled(arguments: Sequence[object], file: Path, names: Sequence[str]) -> lis
     return [places.get(argument, argument) for argument in arguments]
 
 
-@pytest.mark.parametrize("columns", ["", "40"])
-@pytest.mark.parametrize("arguments", OF_FILE.values(), ids=OF_FILE)
+IN_COLUMNS = [
+    pytest.param(arguments, columns, marks=pytest.mark.thorough if columns and name != "info" else ())
+    for name, arguments in OF_FILE.items()
+    for columns in ("", "40")
+]
+
+
+@pytest.mark.parametrize(("arguments", "columns"), IN_COLUMNS)
 def test_no_command_prints_a_name_of_a_file_as_it_is(
     recording: Path,
     plain_recording: Path,

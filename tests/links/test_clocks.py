@@ -211,6 +211,10 @@ def test_an_offset_that_grows_while_nobody_sends_is_told() -> None:
     with here.bus.events() as events:
         world.run(60.0)
         assert [event.over for event in iter(events.queue.get, None) if isinstance(event, ClockOffset)] == [False]
+    # Signs are rare at rest, but a link that joins is answered soon.
+    late = world.process(network, clock=SkewedClock(world))
+    world.run(2.0)
+    assert clock_of(here, late).offset == pytest.approx(0.0, abs=0.003)
 
 
 def test_a_bus_with_a_simulated_clock_is_told_as_one_and_not_measured() -> None:

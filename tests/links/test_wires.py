@@ -16,7 +16,7 @@ from support.wires import LIVE, met, running
 from tfbus.links.local.local_wire import LocalWire
 from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Wire
 
-pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
+pytestmark = pytest.mark.anyio
 
 Make = Callable[..., Wire]
 """Makes a wire of a robot, by default of none, in a domain."""
@@ -47,6 +47,7 @@ async def make(request: pytest.FixtureRequest) -> AsyncIterator[Make]:
         yield made
 
 
+@pytest.mark.every_loop
 async def test_links_meet_and_what_they_publish_comes_to_all_others_and_what_they_send_to_one(make: Make) -> None:
     async with running(make("r1")) as one, running(make("r2")) as two, running(make()) as three:
         await met(one, two, three)
@@ -109,6 +110,7 @@ async def test_a_message_for_one_link_also_comes_to_one_that_does_not_hear_the_s
         assert (deaf.present, other.messages) == ({}, [])
 
 
+@pytest.mark.every_loop
 async def test_messages_of_each_kind_come_whole_in_their_order_and_all_before_the_end(make: Make) -> None:
     published = [b"p" * (1 + number % 50 * 40) + b"%d" % number for number in range(100)]
     sent = [b"s" * (1 + number % 50 * 40) + b"%d" % number for number in range(100)]
@@ -141,6 +143,7 @@ async def test_a_message_may_be_as_long_as_any(make: Make) -> None:
         await until(arrived)
 
 
+@pytest.mark.every_loop
 async def test_a_wire_may_be_closed_twice_and_without_being_opened(make: Make) -> None:
     wire = make()
     await wire.close()

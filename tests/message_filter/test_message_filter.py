@@ -144,6 +144,26 @@ async def test_a_message_needs_the_transforms_of_all_targets(bus: Bus, buffer: B
         tasks.cancel_scope.cancel()
 
 
+@pytest.mark.parametrize(
+    ("order", "before", "after"), [("ready", [7, 3], [5]), ("stamp", [3], [5, 7]), ("arrival", [], [5, 7, 3])]
+)
+async def test_a_message_that_waits_holds_back_the_others_that_the_order_says(
+    bus: Bus, buffer: Buffer, streams: Streams, order: Any, before: list[int], after: list[int]
+) -> None:
+    bus.publish(static("map", "lidar"))
+    got: list[Any] = []
+    pairs = MessageFilter(streams.receive, buffer, "map", order=order)
+    async with pairs, anyio.create_task_group() as tasks:
+        tasks.start_soon(read, pairs, got)
+        put(streams, Scan(5), Scan(7, "lidar"), Scan(3, "lidar"))
+        await settle()
+        assert stamps(got) == before
+        bus.publish(moving("map", "laser", 5))
+        await settle()
+        assert stamps(got) == before + after
+        tasks.cancel_scope.cancel()
+
+
 async def test_a_margin_requires_the_transform_after_the_stamp_too(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     got: list[Pair] = []
     async with (

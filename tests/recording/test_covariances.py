@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -149,9 +150,10 @@ def test_every_format_keeps_covariances_and_parts_edits_and_merges_do(
     ] * 2
     both = [each for each in by_kind(BATCHES[3:]) if each[0].child == "base" for _ in range(2)]
     assert [each[1:] for each in found[2:]] == [each[1:] for each in both]
-    convert([path], new, edits=Edits(drop_static=True), topics=["tf"], schema=schema, overwrite=True)
-    with open_recording(new) as recording:
-        assert {topic.name for topic in recording.topics} == {"/tf", "/tf_covariance"}
+    for edits, topics in ((Edits(drop_static=True), None), (Edits(), ["tf"])):
+        convert([path], new, edits=edits, topics=topics, schema=schema, overwrite=True)
+        with open_recording(new) as recording:
+            assert {topic.name for topic in recording.topics} == {"/tf", "/tf_covariance"}
 
 
 def test_a_trajectory_says_that_it_has_no_covariances(tmp_path: Path) -> None:
@@ -184,9 +186,10 @@ def test_covariances_find_their_transforms_across_blocks_and_from_any_log_time(t
     with closing(McapCopy(path, "")) as copy:
         for sample in samples:
             copy.write(errors, sample.stamp, write_covariances([raw_of(sample)]))
-            # A picture fills a chunk, so the transform is in the next one.
+            # A picture fills a chunk, so each of the others is in a block of its own.
             copy.write(camera, sample.stamp, bytes(2**21))
             copy.write(plain, sample.stamp, encode([sample]))
+            copy.write(camera, sample.stamp, bytes(2**21))
         copy.finish()
     for read in (messages_in, in_blocks):
         for since in (None, 3):
@@ -197,8 +200,8 @@ def test_covariances_find_their_transforms_across_blocks_and_from_any_log_time(t
 
 def test_a_batch_of_any_size_is_written_in_messages_that_can_be_read(tmp_path: Path) -> None:
     error = Covariance.of(xyz=0.5)
-    names = [f"{number:0900}" for number in range(4_500)]
-    batch = tuple(UncertainSample("map", name, 5, random_transform(RNG), covariance=error) for name in names)
+    names, place = [f"{number:0900}" for number in range(4_501)], random_transform(RNG)
+    batch = tuple(UncertainSample(a, b, 5, place, covariance=error) for a, b in pairwise(names))
     path = write_recording(tmp_path / "run.mcap", (SECOND, batch))
     assert in_file(path) == list(map(told, batch))
 
@@ -253,6 +256,7 @@ def test_covariances_without_transforms_are_dropped_beyond_a_bound_and_told(tmp_
         for payload in (many, more, GOOD):
             copy.write(covariance_channel("/tf_covariance", {}), 7, payload)
         copy.write(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"), 7, encode([SAMPLE]))
+        copy.write(covariance_channel("/tf_covariance", {}), 7, many)
         copy.finish()
     messages = messages_in(path)
     assert [str(error) for message in messages for error in message.errors] == [

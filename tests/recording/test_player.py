@@ -6,7 +6,7 @@ import sys
 import threading
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -61,21 +61,29 @@ def x_at(buffer: Buffer, seconds: float) -> float:
     return buffer.lookup_nowait("map", "base", START + round(seconds * SECOND)).transform.translation[0]
 
 
+ABOUT_TO_OPEN: dict[str, Callable[[], object]] = {}
+
+
+@cache
+def hear_of_opened_files() -> None:
+    """Call what is in `ABOUT_TO_OPEN` for a file; once, because no interface removes an audit hook, and each costs."""
+
+    def hear(event: str, arguments: tuple[object, ...]) -> None:
+        if ABOUT_TO_OPEN and event == "open" and (call := ABOUT_TO_OPEN.get(str(arguments[0]))):
+            call()
+
+    sys.addaudithook(hear)
+
+
 @contextmanager
 def before_opening(path: Path, call: Callable[[], object]) -> Iterator[None]:
     """Call a function in each thread that is about to open a file."""
-    listening = [True]
-
-    def hear(event: str, arguments: tuple[object, ...]) -> None:
-        if listening and event == "open" and arguments[0] in (path, str(path)):
-            call()
-
-    # No interface removes an audit hook.
-    sys.addaudithook(hear)
+    hear_of_opened_files()
+    ABOUT_TO_OPEN[str(path)] = call
     try:
         yield
     finally:
-        listening.clear()
+        del ABOUT_TO_OPEN[str(path)]
 
 
 class Listener:

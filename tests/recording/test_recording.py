@@ -6,7 +6,6 @@ import math
 import os
 import socket
 import struct
-import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from itertools import cycle
@@ -259,20 +258,18 @@ def test_a_file_that_cannot_be_opened_is_missing_or_unreadable(tmp_path: Path) -
     assert raised.value.reason == "unreadable"
 
 
-def test_without_a_package_the_error_names_the_extra_and_other_formats_are_read(tmp_path: Path) -> None:
+def test_without_a_package_the_error_names_the_extra_and_other_formats_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("map", "base", 1)])])
-    program = (
-        "import sys; sys.modules['mcap'] = None\n"
-        "from tfbus.recording import RecordingError, open_recording\n"
-        f"open_recording({str(SMALL)!r}).close()\n"
-        "try:\n"
-        f"    open_recording({str(path)!r})\n"
-        "except RecordingError as error:\n"
-        "    print(error.reason, error)\n"
-    )
-    done = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("missing extra ")
-    assert 'pip install "tfbus[bag]"' in done.stdout
+    for name in {"mcap", *(name for name in sys.modules if name.startswith("mcap."))}:
+        monkeypatch.setitem(sys.modules, name, None)
+    for name in [name for name in sys.modules if name.startswith("tfbus.recording.formats.mcap")]:
+        monkeypatch.delitem(sys.modules, name)
+    open_recording(SMALL).close()
+    with pytest.raises(RecordingError, match=r'pip install "tfbus\[bag\]"') as raised:
+        open_recording(path)
+    assert raised.value.reason == "missing extra"
 
 
 def write_channels(path: Path, topics: Sequence[str], lines: Iterable[tuple[int, int]]) -> Path:

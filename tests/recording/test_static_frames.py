@@ -145,12 +145,12 @@ def test_a_wrong_or_hostile_file_is_an_error_of_bounded_length_that_names_the_en
 
 
 def test_a_file_that_is_not_there_or_cannot_be_read_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="there is no such file") as missing:
+    with pytest.raises(FileNotFoundError, match=r"^file .*: there is no such file") as missing:
         load_static(tmp_path / "a.json")
     assert isinstance(missing.value, MissingRecordingError)
     with pytest.raises(RecordingError) as unreadable:
         load_static(tmp_path)
-    assert str(unreadable.value) == f"recording {str(tmp_path)!r}: it cannot be read: {os.strerror(errno.EISDIR)}"
+    assert str(unreadable.value) == f"file {str(tmp_path)!r}: it cannot be read: {os.strerror(errno.EISDIR)}"
     assert unreadable.value.reason == "unreadable"
 
 

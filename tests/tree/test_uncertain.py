@@ -132,7 +132,7 @@ def test_many_answers_without_errors_say_so(count: int) -> None:
     ("kind", "in_frame"), [("independent", False), ("independent", True), ("drift", True), ("constant", False)]
 )
 def test_a_twist_has_the_error_of_the_motion_between_its_samples(kind: Kind, in_frame: bool) -> None:
-    rng, worlds = np.random.default_rng(3), 2000
+    rng, worlds = np.random.default_rng(3), 1000
     # The reference climbs an edge that moves, and the frame hangs on one that moves and on one that does not.
     mount = random_transform(rng)
     ends = {name: [random_transform(rng), random_transform(rng)] for name in ("eye", "base")}

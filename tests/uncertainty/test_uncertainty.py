@@ -132,7 +132,7 @@ def test_beyond_first_order_an_answer_says_that_it_is_not_linear(trees: int) -> 
 
 
 def test_draws_of_an_answer_have_its_true_distribution_beyond_first_order() -> None:
-    for seed in range(3):
+    for seed in range(2):
         found, truth = random_chain(np.random.default_rng(seed), 0.4, 20_000)
         drawn = found.sample(20_000, rng=seed).matrices()
         assert difference(covariance_around(drawn, found.transform.matrix()), truth) < 0.05, seed

@@ -92,17 +92,17 @@ class WebServer:
                 await self._listener.aclose()
 
     async def _listen(self) -> anyio.abc.Listener[anyio.abc.SocketStream]:
-        last = 65_535 if self._search and self._port else self._port
-        for port in range(self._port, last + 1):
+        port = self._port
+        while True:
             try:
                 # A cancellation must not lose the listener.
                 with anyio.CancelScope(shield=True):
                     return await anyio.create_tcp_listener(local_host=self._host, local_port=port)
             except OSError as error:
-                if port == last or error.errno != errno.EADDRINUSE:
+                if not self._search or port in (0, 65_535) or error.errno != errno.EADDRINUSE:
                     reason = error.strerror or error
                     raise OSError(error.errno, f"cannot listen at {self._host}:{port}: {reason}") from error
-        raise AssertionError
+            port += 1
 
     async def _serve(self) -> None:
         await self._listener.serve(self._admit)

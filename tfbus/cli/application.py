@@ -45,6 +45,19 @@ COMMANDS = {
 }
 """The first line of the help of each subcommand, so that a list of them loads none."""
 
+_OPTIONAL = {
+    "check": "[WHAT]",
+    "convert": "SOURCE [FURTHER...]",
+    "monitor": "[TARGET SOURCE]",
+    "plot": "FILE [FRAMES...]",
+    "query": "FILE TARGET SOURCE [FURTHER...]",
+    "robot": "[FILE] [POSITION...]",
+    "static": "PARENT [CHILD]",
+    "tree": "[FILE]",
+    "view": "[FILE]",
+}
+"""The arguments of each subcommand that may be left out in part; cyclopts does not name them."""
+
 _MODULES = dict.fromkeys(("broadcast", "demo", "listen"), "tutorial")
 """The module of a subcommand, where it is not the one of its name."""
 _SUMMARY = "Stamped coordinate transforms for asyncio and trio."
@@ -172,7 +185,8 @@ def application(command: str | None) -> Any:
     )
     for name, summary in COMMANDS.items():
         path = f"tfbus.cli.commands.{_MODULES.get(name, name)}:{name}"
-        app.command(path, name=name, help=None if name == command else summary)
+        usage = f"Usage: tfbus {name} [OPTIONS] {_OPTIONAL[name]}" if name in _OPTIONAL else None
+        app.command(path, name=name, help=None if name == command else summary, usage=usage)
     app.register_install_completion_command(help=_INSTALL_COMPLETION)
 
     @app.meta.default

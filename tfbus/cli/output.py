@@ -175,10 +175,10 @@ def table_lines(
         return sum(widths) if width is None else width - len(_GAP) * (len(shown) - 1)
 
     while sum(widths[at] for at in shown) > room():
-        optional = [at for at in shown if columns[at].importance is not None]
+        optional = {at: importance for at in shown if (importance := columns[at].importance) is not None}
         if not optional:
             break
-        shown.remove(min(optional, key=lambda at: columns[at].importance or 0))
+        shown.remove(min(optional, key=optional.__getitem__))
     fitted = dict(zip(shown, shorten_widest([widths[at] for at in shown], room()), strict=True))
     for line in lines:
         yield _GAP.join(align(shorten(line[at], fitted[at]), fitted[at], columns[at].right) for at in shown).rstrip()

@@ -18,7 +18,6 @@ import os
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
@@ -386,8 +385,7 @@ class Recording:
     def _messages(self, storage: Storage, since: int | None, until: int | None) -> Iterator[RecordedMessage]:
         if since is not None:
             yield from self._latched(storage, since)
-        decode = partial(self._message, {})
-        yield from filter(None, map(decode, storage.messages(self._is_wanted, since, until)))
+        yield from filter(None, map(self._decoding({}), storage.messages(self._is_wanted, since, until)))
 
     def blocks(self, since: int | None = None, until: int | None = None) -> Iterator[Block | DecodedBlock]:
         """All messages as `messages` gives them, in blocks that can be decoded at once; for `load` and `summarise`.
@@ -402,7 +400,7 @@ class Recording:
         storage = self._opened
         columns = ColumnDecoder(self._decoders)
         pending: dict[Key, Belief] = {}
-        decode = partial(self._message, pending)
+        decode = self._decoding(pending)
         if since is not None:
             yield DecodedBlock(list(self._latched(storage, since)))
         for content in blocks_of(storage, self._is_wanted, since, until):
@@ -411,8 +409,8 @@ class Recording:
     def _latched(self, storage: Storage, since: int) -> Iterator[RecordedMessage]:
         """The newest static transform of each frame from before a log time."""
         latched: dict[str, TransformStamped] = {}
-        decode = partial(self._message, {})
-        for message in filter(None, map(decode, storage.messages(self._is_static, None, since - 1))):
+        before = storage.messages(self._is_static, None, since - 1)
+        for message in filter(None, map(self._decoding({}), before)):
             for sample in message.batch:
                 # In the order of the newest samples.
                 latched.pop(sample.child, None)
@@ -437,25 +435,30 @@ class Recording:
     def _is_static(self, channel: Channel) -> bool:
         return self._is_wanted(channel) and (self._decoders.get(channel) or self._covariances[channel]).static
 
-    def _message(self, pending: dict[Key, Belief], stored: StoredMessage) -> RecordedMessage | None:
-        """A message with its samples; None for covariances, which wait for theirs in `pending`."""
-        received, channel, payload = stored
-        if isinstance(channel, MalformedMessageError):
-            return RecordedMessage(received, (), (channel,))
-        decoder = self._decoders.get(channel)
-        plain = None if decoder is None or decoder.decode_plain is None else decoder.decode_plain(payload)
-        if plain is not None:
-            return RecordedMessage(received, _believed(plain, pending) if pending else plain, ())
-        try:
-            if decoder is None:
-                _note_beliefs(pending, channel, payload, self._covariances[channel].prefix)
-                return None
-            samples, errors = decoder.decode(payload)
-        except MalformedMessageError as error:
-            # Its traceback would keep the payload.
-            return RecordedMessage(received, (), (MalformedMessageError(error.reason, error.detail),))
-        batch = tuple(filter(None, samples))
-        return RecordedMessage(received, _believed(batch, pending) if pending else batch, tuple(errors))
+    def _decoding(self, pending: dict[Key, Belief]) -> Callable[[StoredMessage], RecordedMessage | None]:
+        """A function that decodes the messages of one reading; it gives None for covariances, and keeps them."""
+        decoders, covariances = self._decoders, self._covariances
+
+        def decode(stored: StoredMessage) -> RecordedMessage | None:
+            received, channel, payload = stored
+            if isinstance(channel, MalformedMessageError):
+                return RecordedMessage(received, (), (channel,))
+            decoder = decoders.get(channel)
+            plain = None if decoder is None or decoder.decode_plain is None else decoder.decode_plain(payload)
+            if plain is not None:
+                return RecordedMessage(received, _believed(plain, pending) if pending else plain, ())
+            try:
+                if decoder is None:
+                    _note_beliefs(pending, channel, payload, covariances[channel].prefix)
+                    return None
+                samples, errors = decoder.decode(payload)
+            except MalformedMessageError as error:
+                # Its traceback would keep the payload.
+                return RecordedMessage(received, (), (MalformedMessageError(error.reason, error.detail),))
+            batch = tuple(filter(None, samples))
+            return RecordedMessage(received, _believed(batch, pending) if pending else batch, tuple(errors))
+
+        return decode
 
     def _check_topics(self, storage: Storage) -> None:
         """Raise `RecordingError` if a topic that was asked for is not there, as far as the file tells."""

@@ -6,6 +6,7 @@ import os
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -134,6 +135,7 @@ def load_static(path: str | os.PathLike[str], *, authority: str = "") -> list[Tr
     ...     bus.publish(load_static("calibration.yaml", authority="calibration"))
     """
     file = Path(path)
+    refused = partial(RecordingError, path=str(file), kind="file")
     try:
         with file.open("rb") as content:
             data = content.read(MAX_INDEX + 1)
@@ -141,24 +143,19 @@ def load_static(path: str | os.PathLike[str], *, authority: str = "") -> list[Tr
             raise ValueError(f"it has more than {MAX_INDEX:,} bytes, which is the bound")
         entries = _parse(data.decode())
     except FileNotFoundError:
-        raise MissingRecordingError(path=str(file)) from None
+        raise MissingRecordingError(path=str(file), kind="file") from None
     except OSError as error:
-        raise RecordingError(
-            f"it cannot be read: {error.strerror or error}", path=str(file), reason="unreadable"
-        ) from error
+        raise refused(f"it cannot be read: {error.strerror or error}", reason="unreadable") from error
     except ValueError as error:
-        raise RecordingError(
-            f"it is neither YAML nor JSON: {error}"[:_LONGEST], path=str(file), reason="foreign"
-        ) from error
+        raise refused(f"it is neither YAML nor JSON: {error}"[:_LONGEST], reason="foreign") from error
     if not isinstance(entries, list):
-        problem = "it is not a list of transforms, each with a parent and a child"
-        raise RecordingError(problem, path=str(file), reason="foreign")
+        raise refused("it is not a list of transforms, each with a parent and a child", reason="foreign")
     samples = []
     for number, entry in enumerate(entries, 1):
         try:
             samples.append(_sample(entry, authority))
         except (ValueError, TypeError, ArithmeticError, LookupError, RecursionError) as error:
-            raise RecordingError(f"transform {number}: {error}"[:_LONGEST], path=str(file), reason="damaged") from error
+            raise refused(f"transform {number}: {error}"[:_LONGEST], reason="damaged") from error
     return samples
 
 

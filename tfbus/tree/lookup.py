@@ -5,6 +5,7 @@ extrapolates nothing, and interpolates between any two samples, however far apar
 """
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypedDict
@@ -340,8 +341,12 @@ def answer(
     fixed: str | None,
     bounds: Bounds | None,
     policy: Policy | None,
+    read: Callable[[int], object] | None = None,
 ) -> TransformStamped:
-    """The answer of `TransformTree.lookup` to a question that has no plain answer, or is not plain."""
+    """The answer of `TransformTree.lookup` to a question that has no plain answer, or is not plain.
+
+    With `read`, the caller reads more of the tree at the stamp of the answer, while the tree stays as it is.
+    """
     if bounds is not None and at is not LATEST and source_at is not LATEST:
         raise TypeError(AT_LATEST_ONLY)
     if type(at) is not int and at is not LATEST:
@@ -363,6 +368,8 @@ def answer(
             stamp, row, static = find_in_time_travel(
                 forest, target, source, at, source_at, fixed, bounds, extrapolation
             )
+        if read is not None:
+            read(stamp)
     if extrapolation is None:
         return answer_of(target, source, stamp, row, static)
     return qualified_answer(target, source, stamp, row, static, extrapolation.extrapolated_by, extrapolation.gap)

@@ -9,13 +9,12 @@ import numpy as np
 
 from tfbus.errors import TransformLookupError
 from tfbus.geometry.covariance import Matrix, lever_arm, turned
-from tfbus.geometry.stamped import answer_of, qualified_answer
 from tfbus.geometry.uncertain import Belief
 from tfbus.rows import IDENTITY, Columns, Row, Vector, compose, invert
 from tfbus.stamps import LATEST, AtLike, Stamps, as_at
 from tfbus.tree.forest import Forest, Path
 from tfbus.tree.history import FrameHistory, Samples
-from tfbus.tree.lookup import Bounds, Extrapolation, Policy, answer, find, find_in_time_travel, read_stamp
+from tfbus.tree.lookup import Bounds, Extrapolation, Policy, answer, find, read_stamp
 from tfbus.tree.lookup_many import OutOfRange, Segments, lookup_many, nanoseconds
 from tfbus.uncertainty.answers import (
     Link,
@@ -40,25 +39,19 @@ def uncertain_answer(
     policy: Policy | None,
 ) -> UncertainTransform:
     """The answer of `tfbus.tree.lookup.answer` to the same question, with the edges that it was made of."""
-    # It raises every error, and keeps the path, outside of the lock.
-    answer(forest, target, source, at, source_at, fixed, bounds, policy)
-    extrapolation = None if policy is None else Extrapolation(policy)
-    with forest.lock:
+    links: list[Link] = []
+
+    def read(stamp: int) -> None:
         if fixed is None:
-            stamp, row, static = find(forest, target, source, as_at(at), bounds, extrapolation)
-            links = _links(forest, target, source, stamp, policy)
-        else:
-            stamp, row, static = find_in_time_travel(
-                forest, target, source, at, source_at, fixed, bounds, extrapolation
-            )
-            there = find(forest, target, fixed, as_at(at), bounds, extrapolation)[0]
-            # Time travel without a stamp of source has raised its error.
-            here = find(forest, fixed, source, as_at(cast(AtLike, source_at)), bounds, extrapolation)[0]
-            links = _links(forest, target, fixed, there, policy) + _links(forest, fixed, source, here, policy)
-    if extrapolation is None:
-        return uncertain(answer_of(target, source, stamp, row, static), links)
-    use = extrapolation.extrapolated_by, extrapolation.gap
-    return uncertain(qualified_answer(target, source, stamp, row, static, *use), links)
+            links.extend(_links(forest, target, source, stamp, policy))
+            return
+        extrapolation = None if policy is None else Extrapolation(policy)
+        # Time travel without a stamp of source has raised its error.
+        for above, below, when in ((target, fixed, at), (fixed, source, cast(AtLike, source_at))):
+            half = find(forest, above, below, as_at(when), bounds, extrapolation)[0]
+            links.extend(_links(forest, above, below, half, policy))
+
+    return uncertain(answer(forest, target, source, at, source_at, fixed, bounds, policy, read), links)
 
 
 def edges_of(path: Path, forest: Forest) -> list[tuple[FrameHistory, bool]]:

@@ -1,25 +1,16 @@
 """`ZenohLink` at the door: its promises beyond those that the tests of the wire hold."""
 
 import gc
-import sys
 import threading
 import weakref
 
 import pytest
-from support.processes import Program, until
+from support.processes import until
 
 from tfbus import Bus, Transform, TransformBroadcaster
-from tfbus.errors import pip_install
 from tfbus.links.zenoh import ZenohLink, ZenohRouter
 
 pytestmark = pytest.mark.anyio
-
-
-async def test_without_zenoh_the_import_names_the_extra() -> None:
-    program = "import sys; sys.modules['zenoh'] = None; import tfbus.links.zenoh"
-    with Program(sys.executable, "-P", "-c", program) as done:
-        assert done.wait() == 1
-        assert done.errors.text.splitlines()[-1].endswith(f"one more package: {pip_install('zenoh')}")
 
 
 async def test_links_that_have_ended_are_freed_with_their_threads(address: str, domain: str) -> None:

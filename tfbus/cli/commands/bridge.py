@@ -43,7 +43,9 @@ def bridge(
     Parameters
     ----------
     first
+        ROS, or the name of a domain.
     second
+        Another place of ROS, or domain.
     listen
         Run a router in this program that listens at this address; may be given several times.
     connect

@@ -60,7 +60,7 @@ def check(
     until
         For a recording, where to stop, in the same ways.
     duration
-        For a domain, how many seconds to listen.
+        For a domain, how many seconds to listen, from the first transform on.
     max_translation
         The longest possible translation, in m.
     max_speed

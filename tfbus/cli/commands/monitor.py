@@ -114,7 +114,7 @@ def monitor(
     once
         Print once and end.
     duration
-        With --once, how many seconds to listen first.
+        With --once, how many seconds to listen first, from the first transform on.
     as_json
         Print a JSON object instead, one a line unless --once is given; durations in s, and sigmas as standard
         deviations along x, y, z in m and about x, y, z in rad.

@@ -51,7 +51,7 @@ def tree(
 ) -> None:
     """Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.
 
-    Standard error then says how many programs it hears, and how they are reached.
+    Standard error says how many programs it hears, and how they are reached.
 
     Example: tfbus tree --svg frames.svg
 

@@ -27,7 +27,6 @@ from tfbus.frames import is_frame
 from tfbus.geometry.covariance import Covariance
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.geometry.uncertain import Belief, with_belief
-from tfbus.recording.formats.covariances import holds_covariances
 from tfbus.recording.formats.storage import (
     AUTHORITIES,
     MAX_MESSAGE,
@@ -118,8 +117,6 @@ def _pose_parser(channel: Channel, child: str | None) -> Callable[[bytes], list[
 
 def parser_of(channel: Channel, child: str | None = None) -> Callable[[bytes], list[RawTransform]]:
     """The function that parses the messages of a channel, poses with a `child`; it raises `MalformedMessageError`."""
-    if holds_covariances(channel):
-        return lambda payload: []  # noqa: ARG005
     if needs_child(channel) is not None:
         return _pose_parser(channel, child)
     single = channel.type.endswith("FrameTransform")
