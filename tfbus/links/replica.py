@@ -415,7 +415,7 @@ class Replica:
         if sample is None:
             insort(self._removals, (source.rank, frame))
             if len(self._removals) > MOST_REMOVALS:
-                # Those of the lowest ranks, so that all copies forget the same ones.
+                # The removal of the lowest rank goes, so that all copies forget the same ones.
                 self.discard(self.entries[self._removals[0][1]])
         return True
 
