@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from support.fault_world import OneMachine, Routers, short_directory
+from support.namespaces import Network, absent
 from support.processes import Crowd, crowd
 
 FIRST, LAST = (int(seed) for seed in os.environ.get("FAULT_SEEDS", "1 1").split())
@@ -57,4 +58,17 @@ def test_all_buses_behind_routers_are_equal_after_each_fault(
     pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
     routers, inside = 2 if kind == "two routers" else 1, directory if kind == "both links" else None
     with Routers(processes, seed, drop_lost, routers, inside) as world:
+        tell(capsys, world.run(seconds=SECONDS))
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(absent() is not None, reason=absent() or "")
+@DROP_LOST
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("routers", [0, 1, 2], ids=["one listens", "one router", "two routers"])
+def test_all_buses_of_several_machines_are_equal_after_each_fault(
+    processes: Crowd, seed: int, drop_lost: bool, routers: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
+    with Network(routers + 4) as network, Routers(processes, seed, drop_lost, routers, network=network) as world:
         tell(capsys, world.run(seconds=SECONDS))
