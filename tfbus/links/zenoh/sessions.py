@@ -31,6 +31,9 @@ OPENING_TIME: Final = 2.0
 UNSENT: Final = 8
 """So many buffers of 64 KiB may wait for the router before messages are dropped; zenoh's two are full whenever its
 thread waits for a CPU for some ms."""
+RECEIVING_THREADS: Final = 32
+"""of a router. zenoh ends a connection that is cut off by a call that waits 10 s (its issue 2718) in one of them; of its
+usual two, both waited where two connections were lost, and the router passed on nothing meanwhile."""
 LONGEST_NAME: Final = 200
 CLOSING_TIME: Final = 1.0
 LONGEST_CLOSE: Final = 15.0
@@ -158,6 +161,9 @@ def open_session(config: zenoh.Config, settings: Mapping[str, object] | None = N
         If this process was forked from one that uses zenoh.
     """
     use_zenoh()
+    if config.get_json("mode") == '"router"':
+        # zenoh reads it once in a process, with its first session.
+        os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {RECEIVING_THREADS}))")
     try:
         for path, value in (settings or {}).items():
             config.insert_json5(path, json.dumps(value))
