@@ -228,9 +228,9 @@ def show_delay(table: Table, label: str, here: PeerProcess, there: PeerProcess, 
 @BACKENDS
 @pytest.mark.parametrize(("rate", "wanted"), [(100, "p50 <= 0.35 ms"), (1_000, "p50 <= 0.25 ms")])
 def test_delay(backend: str, rate: int, wanted: str, table: Table, place: Place, processes: Crowd) -> None:
-    both = [processes.add(place.first(), backend=backend) for _ in range(2)]
-    meet(*both)
-    show_delay(table, f"delay, {backend}", *both, rate, wanted)
+    here, there = (processes.add(place.first(), backend=backend) for _ in range(2))
+    meet(here, there)
+    show_delay(table, f"delay, {backend}", here, there, rate, wanted)
 
 
 @BACKENDS

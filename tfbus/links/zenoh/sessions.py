@@ -32,8 +32,8 @@ UNSENT: Final = 8
 """So many buffers of 64 KiB may wait for the router before messages are dropped; zenoh's two are full whenever its
 thread waits for a CPU for some ms."""
 RECEIVING_THREADS: Final = 32
-"""of a router. zenoh ends a connection that is cut off by a call that waits 10 s (its issue 2718) in one of them; of its
-usual two, both waited where two connections were lost, and the router passed on nothing meanwhile."""
+"""of a router. zenoh ends a connection that is cut off by a call that waits 10 s (its issue 2718) in one of them; both of
+its usual two waited after two such losses, and the router passed on nothing meanwhile."""
 LONGEST_NAME: Final = 200
 CLOSING_TIME: Final = 1.0
 LONGEST_CLOSE: Final = 15.0
