@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from beside import Ask, Table
 from cases import Case, Vector
-from support.processes import Place
 
 
 @pytest.fixture(scope="session")
@@ -17,14 +16,6 @@ def table(request: pytest.FixtureRequest) -> Table:
     table = Table()
     request.config.pluginmanager.register(table)
     return table
-
-
-@pytest.fixture(params=["one machine", "router"])
-def place(request: pytest.FixtureRequest) -> Place:
-    """A new domain over either carrier."""
-    if request.param == "router":
-        pytest.importorskip("zenoh")
-    return Place(request.param)
 
 
 @pytest.fixture(scope="module", params=[("/usr/bin/python3",), (os.environ.get("ROS2_PYTHON"), "ros2")], ids=str)

@@ -31,6 +31,8 @@ class Facts(NamedTuple):
 
     met: float
     """Seconds from the last start until it had all static frames; infinite if it never had."""
+    linked: float
+    """The same from the moment when the last process, with all its imports, began its link."""
     delay: float
     """The median of the seconds from the stamp of a sample until it was here, once all were there."""
 
@@ -56,6 +58,7 @@ async def live(number: int, processes: int, link: dict[str, Any], seconds: float
         broadcaster = TransformBroadcaster(bus, authority=f"p{number}")
         for frame in range(FRAMES):
             broadcaster.send_static("map", f"static {number} {frame}", Transform())
+        began = time.monotonic()
         async with link_of(bus, link):
             await bus.clock.sleep(number / processes / RATE)
             told = False
@@ -63,7 +66,7 @@ async def live(number: int, processes: int, link: dict[str, Any], seconds: float
                 broadcaster.send_all([("map", f"moving {number} {frame}", Transform()) for frame in range(FRAMES)])
                 if not told and met + seconds < time.monotonic():
                     told = True
-                    print(json.dumps([met, median(delays or [math.inf])]), flush=True)
+                    print(json.dumps([began, met, median(delays or [math.inf])]), flush=True)
 
 
 def measure(processes: int, place: Place, seconds: float = 0.0) -> list[Facts]:
@@ -96,8 +99,9 @@ def measure(processes: int, place: Place, seconds: float = 0.0) -> list[Facts]:
             end_all()
             for process in started:
                 process.communicate()
-    found = [json.loads(end) if end else (math.inf, math.inf) for end in ends]
-    return [Facts(met - last, delay) for met, delay in found]
+    found = [json.loads(end) if end else (0.0, math.inf, math.inf) for end in ends]
+    linked = max(began for began, _, _ in found)
+    return [Facts(met - last, met - linked, delay) for _, met, delay in found]
 
 
 if __name__ == "__main__":

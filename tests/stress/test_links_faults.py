@@ -5,11 +5,13 @@ is the time until all are equal.
 """
 
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support.fault_world import OneMachine, Routers, short_directory
+from support.fault_world import LIMIT, OneMachine, Routers, short_directory
+from support.namespaces import Network, absent
 from support.processes import Crowd, crowd
 
 FIRST, LAST = (int(seed) for seed in os.environ.get("FAULT_SEEDS", "1 1").split())
@@ -58,3 +60,37 @@ def test_all_buses_behind_routers_are_equal_after_each_fault(
     routers, inside = 2 if kind == "two routers" else 1, directory if kind == "both links" else None
     with Routers(processes, seed, drop_lost, routers, inside) as world:
         tell(capsys, world.run(seconds=SECONDS))
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(absent() is not None, reason=absent() or "")
+@DROP_LOST
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("routers", [0, 1, 2], ids=["one listens", "one router", "two routers"])
+def test_all_buses_of_several_machines_are_equal_after_each_fault(
+    processes: Crowd, seed: int, drop_lost: bool, routers: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
+    with Network(routers + 4) as network, Routers(processes, seed, drop_lost, routers, network=network) as world:
+        tell(capsys, world.run(seconds=SECONDS))
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(absent() is not None, reason=absent() or "")
+def test_processes_that_are_cut_off_from_a_router_hold_up_no_other(processes: Crowd) -> None:
+    pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
+    with Network(9) as network, Routers(processes, 1, False, 1, network=network) as world:
+        for place in network.places[5:]:
+            world.add(f"{place}", ("zenoh",), world.members[0].links, network.within(place))
+        world.start(*world.members)
+        world.check()
+        away = network.ways(network.places[3:])
+        network.spoil([*away, *((other, place) for place, other in away)], loss=1.0)
+        first, second, *_ = world.members
+        first.process.wait(event="PeerLost")
+        began = time.monotonic()
+        # The router takes all the others for lost within a sign of life of each other.
+        first.process.ask("until", peers=1)
+        world.publish(first, "later")
+        second.process.ask("until", has=["later"])
+        assert time.monotonic() - began < LIMIT / 2

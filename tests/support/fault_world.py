@@ -7,14 +7,16 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import count
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import pytest
+from support.namespaces import Network, Way
 from support.processes import Crowd, PeerProcess, Program, free_address, new_domain
 
 LIMIT = float(os.environ.get("FAULT_LIMIT", "10"))
@@ -27,8 +29,11 @@ Said = tuple[bool, int, float]
 class Member:
     """A place for processes one after another, each with links to some networks; what the newest has heard."""
 
-    def __init__(self, name: str, networks: tuple[str, ...], links: list[dict[str, Any]]) -> None:
+    def __init__(
+        self, name: str, networks: tuple[str, ...], links: list[dict[str, Any]], within: Sequence[str]
+    ) -> None:
         self.name = name
+        self.within = within
         self.networks = networks
         self.links = links
         self.process: PeerProcess
@@ -37,7 +42,7 @@ class Member:
         self.stopped = False
 
     def begin(self, processes: Crowd, backend: str) -> None:
-        self.process = processes.begin(*self.links, backend=backend, keeps=True)
+        self.process = processes.begin(*self.links, backend=backend, keeps=True, within=self.within)
         self.log: list[Any] = []
         self.shown: dict[str, Said] = {}
         self.present: set[str] = set()
@@ -99,9 +104,11 @@ class World:
         self._recent: set[str] = set()
         self._mending: list[Callable[[], object]] = []
 
-    def add(self, name: str, networks: tuple[str, ...], links: list[dict[str, Any]]) -> None:
+    def add(
+        self, name: str, networks: tuple[str, ...], links: list[dict[str, Any]], within: Sequence[str] = ()
+    ) -> None:
         options = {"domain": self.domain, "drop_lost": self.drop_lost}
-        self.members.append(Member(name, networks, [options | link for link in links]))
+        self.members.append(Member(name, networks, [options | link for link in links], within))
 
     def start(self, *members: Member) -> None:
         """Start processes at once."""
@@ -337,13 +344,14 @@ anyio.run(main, *sys.argv[1:])
 class Router:
     """A router in a process, at an address of its own."""
 
-    def __init__(self) -> None:
-        self.address = free_address()
+    def __init__(self, address: str, within: Sequence[str]) -> None:
+        self.address = address
+        self._within = within
         self.others: list[str] = []
         self.program: Program | None = None
 
     def start(self) -> None:
-        self.program = Program(sys.executable, "-P", "-c", _ROUTER, self.address, *self.others)
+        self.program = Program(*self._within, sys.executable, "-P", "-c", _ROUTER, self.address, *self.others)
         self.program.output.expect("ready")
 
     def signal(self, number: signal.Signals) -> None:
@@ -356,25 +364,41 @@ class Router:
 
 
 class Routers(World):
-    """Processes that are clients of one router, or of either of two that are connected.
+    """Processes that are clients of one router, or of either of two that are connected; without any, the first listens.
 
     With a directory, each of two has two more beside it, of which none has a link to a router: a bridge with both
-    links joins them to the others.
+    links joins them to the others. With a network, each router and each process is in a namespace of its own.
     """
 
-    faults = ("kill", "kill_two", "kill_beside_a_stopped_one", "stop", "block", "router_killed", "router_stopped")
+    faults: tuple[str, ...] = ("kill", "kill_two", "kill_beside_a_stopped_one", "stop", "block")
 
     def __init__(
-        self, processes: Crowd, seed: int, drop_lost: bool, routers: int, directory: Path | None = None
+        self,
+        processes: Crowd,
+        seed: int,
+        drop_lost: bool,
+        routers: int,
+        directory: Path | None = None,
+        network: Network | None = None,
     ) -> None:
         super().__init__(processes, seed, drop_lost)
-        self.routers = [Router() for _ in range(routers)]
-        addresses = [router.address for router in self.routers]
+        places = network.places if network else range(routers + 4)
+        addresses = [f"tcp/{network.address(place)}:7447" if network else free_address() for place in places]
+        within = [network.within(place) if network else [] for place in places]
+        self.routers = [Router(addresses[place], within[place]) for place in range(routers)]
+        self._network = network
+        if routers:
+            self.faults += ("router_killed", "router_stopped")
+        if network:
+            self.faults += ("cut", "cut", "cut_one_way", "cut_one_way", "flap", "slow", "slow")
         for number in range(4):
-            turned = addresses[number % routers :] + addresses[: number % routers]
-            link: dict[str, Any] = {"connect": turned, "lease": ROUTER_LEASE}
+            first = number % max(1, routers)
+            link: dict[str, Any] = {"connect": [addresses[first], *addresses[:first], *addresses[first + 1 : routers]]}
+            if number == routers == 0:
+                link = {"listen": addresses[0]}
+            link["lease"] = ROUTER_LEASE
             if directory is None or number > 1:
-                self.add(f"{number}", ("zenoh",), [link])
+                self.add(f"{number}", ("zenoh",), [link], within[routers + number])
             else:
                 inside = {"directory": str(directory / f"{number}")}
                 self.add(f"{number}", ("zenoh", f"local{number}"), [link, inside])
@@ -414,6 +438,45 @@ class Routers(World):
         router = self.rng.choice(self.routers)
         router.signal(signal.SIGSTOP)
         self._mending.append(lambda: router.signal(signal.SIGCONT))
+
+    # Faults of the network
+
+    def _spoil(self, ways: Sequence[Way], loss: float = 1.0, delay: float = 0.0) -> None:
+        assert self._network is not None
+        self._network.spoil(ways, loss, delay)
+        self._mending.append(partial(self._network.spoil, ways))
+
+    def _ways(self) -> tuple[list[Way], list[Way]]:
+        """All ways from a router or a process, to all others or to one of them, and back."""
+        assert self._network is not None
+        place, other = self.rng.sample(self._network.places, 2)
+        away = self._network.ways([place], self.rng.choice((None, None, [other])))
+        self.story[-1] += f" {away}"
+        return away, [(other, place) for place, other in away]
+
+    def fault_cut(self, *_: Member) -> None:
+        away, back = self._ways()
+        self._spoil(away + back)
+        if len(self.routers) > 1 and away[0][0] < 2 and len(away) > 1:
+            # The other router is enough.
+            self.live()
+            self.check()
+
+    def fault_cut_one_way(self, *_: Member) -> None:
+        self._spoil(self.rng.choice(self._ways()))
+
+    def fault_flap(self, *_: Member) -> None:
+        away, back = self._ways()
+        for _again in range(self.rng.randrange(2, 8)):
+            self._spoil(away + back)
+            time.sleep(self.rng.choice((0.1, 0.5, 1.5, 5.0)))
+            self._mending.pop()()
+            time.sleep(self.rng.choice((0.0, 0.1, 0.5, 2.0)))
+
+    def fault_slow(self, *_: Member) -> None:
+        """Delay what a router or a process hears or says, and lose some of it."""
+        for ways in self._ways():
+            self._spoil(ways, self.rng.choice((0.0, 0.05, 0.2)), self.rng.choice((0.0, 0.05, 0.3)))
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import tracemalloc
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import count, islice
 from pathlib import Path
@@ -89,11 +89,13 @@ class Place:
 
 
 class PeerProcess:
-    """One such process; its output is kept until a test asks for it."""
+    """One such process, begun by the words `within` if there are some; its output is kept until a test asks for it."""
 
-    def __init__(self, *links: dict[str, Any], backend: str = "asyncio", keeps: bool = False) -> None:
+    def __init__(
+        self, *links: dict[str, Any], backend: str = "asyncio", keeps: bool = False, within: Iterable[str] = ()
+    ) -> None:
         arguments = {"backend": backend, "links": links, "keeps": keeps}
-        command = [sys.executable, str(_PROGRAM), json.dumps(arguments)]
+        command = [*within, sys.executable, str(_PROGRAM), json.dumps(arguments)]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )

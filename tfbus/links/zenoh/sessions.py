@@ -31,6 +31,11 @@ OPENING_TIME: Final = 2.0
 UNSENT: Final = 8
 """So many buffers of 64 KiB may wait for the router before messages are dropped; zenoh's two are full whenever its
 thread waits for a CPU for some ms."""
+MAX_SESSIONS: Final = 10_000
+"""A router takes so many; zenoh's own thousand would be full without a word."""
+RECEIVING_THREADS: Final = 32
+"""of a router. zenoh ends a connection that is cut off by a call that waits 10 s in one of them (its issue 2718); after
+two such losses both of its usual two waited, and the router passed on nothing meanwhile."""
 LONGEST_NAME: Final = 200
 CLOSING_TIME: Final = 1.0
 LONGEST_CLOSE: Final = 15.0
@@ -101,6 +106,7 @@ def session_config(
             "listen/endpoints": endpoints(listen),
             "connect/timeout_ms": -1,
             "connect/exit_on_failure": False,
+            "transport/unicast/max_sessions": MAX_SESSIONS,
             # It would wait so long for routers that scouting finds.
             "scouting/delay": 0,
             "connect/retry": {"period_init_ms": 200, "period_max_ms": 1_000, "period_increase_factor": 2},
@@ -148,6 +154,9 @@ def open_session(config: zenoh.Config, settings: Mapping[str, object] | None = N
         If this process was forked from one that uses zenoh.
     """
     use_zenoh()
+    if config.get_json("mode") == '"router"':
+        # zenoh reads it once in a process, with its first session.
+        os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {RECEIVING_THREADS}))")
     try:
         for path, value in (settings or {}).items():
             config.insert_json5(path, json.dumps(value))
