@@ -34,6 +34,7 @@ from tfbus import (
     from_seconds,
 )
 from tfbus.errors import AheadError
+from tfbus.links.rosbridge import RosbridgeLink
 from tfbus.recording import Recorder
 
 NOW = 1_700_000_000 * SECOND
@@ -197,6 +198,18 @@ def test_a_prefix_without_its_slash_is_logged(prefix: str, lines: int, caplog: p
     ],
 )
 def test_wrong_arguments_of_do_transform_are_told_apart(mistake: Callable[[], object], why: str) -> None:
+    assert why in told(mistake, TypeError)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "why"),
+    [
+        (lambda: LocalLink(Bus(), robbot="arm"), "a link has no option 'robbot', did you mean 'robot'"),  # type: ignore[call-arg]
+        (lambda: RosbridgeLink(Bus(), "ws://a:9090", framez=("a",)), "no option 'framez', did you mean 'frames'"),  # type: ignore[call-arg]
+        (lambda: LocalLink(Bus(), zzz=1), "a link has no option 'zzz'; there are capacity, clock, correct_clocks"),  # type: ignore[call-arg]
+    ],
+)
+def test_an_option_that_a_link_does_not_have_is_refused(mistake: Callable[[], object], why: str) -> None:
     assert why in told(mistake, TypeError)
 
 

@@ -13,7 +13,7 @@ from tfbus.clock import SimulatedClock
 from tfbus.events import ClockOffset, PeerClockStepped
 from tfbus.links.channels import ALL, QUIET, SLOW, Channels, filter_name
 from tfbus.links.clocks import Clocks
-from tfbus.links.endpoint import MAX_PEERS, Endpoint, HearsTime
+from tfbus.links.endpoint import MAX_PEERS, Endpoint, HearsTime, check_options
 from tfbus.links.history import LONGEST_HISTORY, HistoryAsker, chunk_of_past
 from tfbus.links.lookups import RemoteLookups
 from tfbus.links.message import (
@@ -120,6 +120,7 @@ class DomainEnd(Endpoint):
         now: Callable[[], float] = monotonic,
         **options: Unpack[DomainOptions],
     ) -> None:
+        check_options(options, DomainOptions)
         robot, robots = options.get("robot"), options.get("robots")
         slow_rate, history = options.get("slow_rate", 1.0), options.get("history")
         if isinstance(robots, str):

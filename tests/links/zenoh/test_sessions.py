@@ -112,7 +112,7 @@ def test_each_end_announces_its_lease_and_says_more_often_that_it_lives() -> Non
 
 
 def test_a_router_takes_as_many_sessions_as_a_link_hears_others() -> None:
-    assert read(router_config("tcp/127.0.0.1:0", (), None, None), "transport/unicast/max_sessions") >= MAX_LINKS
+    assert read(session_config("tcp/127.0.0.1:0", (), None, None), "transport/unicast/max_sessions") >= MAX_LINKS
 
 
 def test_settings_of_zenoh_win_over_those_of_the_link() -> None:

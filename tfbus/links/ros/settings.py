@@ -15,7 +15,7 @@ from tfbus.clock import SimulatedClock
 from tfbus.errors import InvalidTransformError
 from tfbus.frames import Prefix, as_prefix
 from tfbus.geometry.stamped import TransformStamped, shifted
-from tfbus.links.endpoint import HearsTime
+from tfbus.links.endpoint import HearsTime, check_options
 from tfbus.stamps import as_offset
 from tfbus.tf_message import refusal
 
@@ -198,6 +198,7 @@ def settings_of(options: RosOptions) -> RosSettings:
     ValueError, TypeError
         If an option is not valid.
     """
+    check_options(options, RosOptions)
     authority = options.get("authority")
     if authority is not None and not isinstance(authority, str):
         raise TypeError(f"authority must be a str, not {authority!r}")
