@@ -10,7 +10,7 @@ A test of hypothesis is in both suites: with a few examples, always the same, in
 the thorough one, new ones at each run unless the variable `CI` is set. ``--hypothesis-profile`` chooses otherwise:
 ``default`` or ``thorough``.
 
-Folders are tested by two processes more than there are cores, because many tests wait for a process or a network, and
+Folders are tested by one process more than there are cores, because many tests wait for a process or a network, and
 by four at most; single files and benchmarks by one. ``-n`` chooses otherwise.
 
 A test, or a file of tests, that needs an extra which is not installed is skipped with the name of the extra.
@@ -102,7 +102,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """None but this one for single files, and for benchmarks, which would disturb each other."""
     paths = [Path(argument.partition("::")[0]) for argument in config.args]
     alone = all(path.is_file() or path.name == "benchmarks" for path in paths)
-    return 0 if alone else min((os.cpu_count() or 1) + 2, 4)
+    return 0 if alone else min((os.cpu_count() or 1) + 1, 4)
 
 
 @pytest.hookimpl(wrapper=True)
