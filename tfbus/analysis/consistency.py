@@ -117,10 +117,16 @@ def _of_one(answer: UncertainTransform, true: Transform) -> tuple[float, int]:
 
 def _error(found: Transform, true: Transform) -> Matrix:
     """The error (d, w) along the axes of the target: the true pose is (p + d, Exp(w) R)."""
-    x, y, z, w = (Transform(rotation=true.rotation) @ Transform(rotation=found.rotation).inverse()).rotation
+    turn = Transform(rotation=true.rotation) @ Transform(rotation=found.rotation).inverse()
+    return np.concatenate((np.subtract(true.translation, found.translation), rotation_vector(turn)))
+
+
+def rotation_vector(transform: Transform) -> Matrix:
+    """The axis of a rotation times its angle from 0 to pi, in rad; shape (3,)."""
+    x, y, z, w = transform.rotation
     sine = math.hypot(x, y, z)
     scale = 2.0 * math.atan2(sine, abs(w)) / sine * math.copysign(1.0, w) if sine else 2.0
-    return np.array([*np.subtract(true.translation, found.translation), x * scale, y * scale, z * scale])
+    return np.array([x * scale, y * scale, z * scale])
 
 
 def quantile(probability: float, degrees: int) -> float:
