@@ -199,7 +199,8 @@ async def test_a_step_is_noticed_and_no_answer_is_between_samples_of_both_sides(
                 assert stepped.step == pytest.approx(step, abs=0.01)
                 assert stepped.frames == ("cart",)
                 spans = {edge.child: (edge.oldest or 0, edge.newest or 0) for edge in buffer.tree.edges()}
-                assert spans["other"][1] - spans["other"][0] > 3 * 10**9
+                # The samples of the other process from before the step are still there.
+                assert spans["other"][1] - spans["other"][0] > 2 * 10**9
                 answers = 0
                 for _ in range(30):
                     await anyio.sleep(0.05)
