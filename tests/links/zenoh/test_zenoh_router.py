@@ -125,15 +125,38 @@ async def test_a_link_that_its_router_tells_nothing_connects_again_and_says_so(
     address: str, domain: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As the session of a router does in which zenoh has panicked.
-    async with ZenohRouter(address), listening(domain, connect=address) as one:
+    async with ZenohRouter(address):
         kinds: list[Any] = [Silent]
         monkeypatch.setattr(wire, "Neighbours", lambda session: (kinds.pop() if kinds else Neighbours)(session))
         async with listening(domain, connect=address) as two:
             await until(lambda: bool(two.warnings))
             assert f"the router at {address} tells nothing, and the link connects again" in str(two.warnings[0])
+            async with listening(domain, connect=address) as one:
+                await met(one, two)
+                await talk(one, two)
+                assert len(two.warnings) == 1
+
+
+async def test_a_link_that_is_told_of_others_stays_connected_without_the_token_of_its_router(
+    address: str, domain: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As on a busy machine, or by access rules.
+    is_late = False
+
+    class Late(Neighbours):
+        def are_silent(self, now: float) -> bool:  # noqa: ARG002 - at any time
+            return is_late
+
+    async with ZenohRouter(address):
+        monkeypatch.setattr(wire, "Neighbours", Late)
+        monkeypatch.setattr(wire, "PERIOD", 0.01)
+        async with listening(domain, connect=address) as one, listening(domain, connect=address) as two:
             await met(one, two)
-            await talk(one, two)
-            assert len(two.warnings) == 1
+            is_late = True
+            for _ in range(20):
+                await talk(one, two)
+            assert not one.warnings
+            assert not two.warnings
 
 
 async def test_a_router_that_gets_no_other_session_says_so_once_and_gets_one_when_it_can(

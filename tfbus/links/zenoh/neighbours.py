@@ -15,8 +15,8 @@ is one of these cases, because zenoh tells tokens and subscribers by the same wa
 another id, which is a new router to all others: it is told everything. Its clients connect again, as after any break.
 
 A link is told nothing if it has connected while the session of the router closed: zenoh 1.10 panics then if it is asked
-for tokens, keeps the connection, and reads nothing from it. So a link waits for the token of its router too, and the
-cure is the same.
+for tokens, keeps the connection, and reads nothing from it. So a link waits for the token of its router too, unless it
+is told of other links, and the cure is the same.
 
 Nothing here heals a third defect, of routers in a ring. A token that ends within some ms of the break of a connection
 is not taken back at its other end, because the first router finds no connection any more, and those around do not pass

@@ -307,6 +307,7 @@ class _Session:
         self._publishing = threading.Lock()
         self._declared: list[object] = []
         self._neighbours: Neighbours | None = None
+        self._is_router = False
         self.broken = False
         self._lock = threading.Lock()
         self._ended = False
@@ -320,6 +321,7 @@ class _Session:
     def begin(self, number: int, *, is_router: bool) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
         session, wire, declared = self._session, self._wire, self._declared
+        self._is_router = is_router
         if not is_router:
             declared.append(session.info.declare_transport_events_listener(_directly(self._take_event)))
         self._neighbours = Neighbours(session)
@@ -344,7 +346,9 @@ class _Session:
 
     def look(self, now: float) -> float | None:
         """Tell of the links that have left by now; the s until the next look, or None to have another session."""
-        if self.broken or (self._neighbours is not None and self._neighbours.are_silent(now)):
+        # A client that is told of other links is told all, and only waits for a token on a busy machine.
+        is_told = bool(self._present) and not self._is_router
+        if self.broken or (self._neighbours is not None and not is_told and self._neighbours.are_silent(now)):
             return None
         with self._lock:
             for link in [link for link, due in self._leaving.items() if due <= now]:
