@@ -349,6 +349,8 @@ class Replica:
         self.sequence = 0
         # How many frames each other origin has.
         self._held: Counter[bytes] = Counter()
+        # Their sum, because a peer may tell of as many origins as frames.
+        self._taken = 0
         # The removals in the order of their ranks.
         self._removals: list[tuple[Rank, str]] = []
         # Frames whose entries have changed since the last claim and are to settle first.
@@ -482,9 +484,10 @@ class Replica:
     def _admit(self, origin: bytes, known: Known | None, sample: TransformStamped | None, max_frames: float) -> None:
         """Count a new entry in place of a known one."""
         if sample is not None and origin != self.origin:
-            if self._held[origin] >= max_frames or self._held.total() >= MANY_ORIGINS * max_frames:
+            if self._held[origin] >= max_frames or self._taken >= MANY_ORIGINS * max_frames:
                 raise TooManyEntriesError(f"the peer has announced more than {max_frames} frames")
             self._held[origin] += 1
+            self._taken += 1
         if known is not None:
             self._release(known)
 
@@ -495,6 +498,7 @@ class Replica:
             del self._removals[bisect_left(self._removals, (known.source.rank, known.frame))]
         elif origin != self.origin:
             self._held[origin] -= 1
+            self._taken -= 1
             if not self._held[origin]:
                 del self._held[origin]
 
