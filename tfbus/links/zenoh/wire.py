@@ -128,7 +128,7 @@ class ZenohWire(Wire):
         self.domain: str = f"tfbus/{domain}"
         self.own: str = f"{self.domain}/{robot or NO_ROBOT}"
         self._addresses = deque(endpoints(connect or ()))
-        self._is_router = listen is not None
+        self.is_router: bool = listen is not None
         if listen is None and not self._addresses:
             raise ValueError(
                 "a link over zenoh needs a router: connect='tcp/host:7447' is the address of one, and "
@@ -164,9 +164,9 @@ class ZenohWire(Wire):
         # A program that exits without the end of its links has them closed all the same.
         atexit.register(self._stop)
         self._thread.start()
-        with anyio.move_on_after(math.inf if self._is_router else FIRST_WAIT):
+        with anyio.move_on_after(math.inf if self.is_router else FIRST_WAIT):
             await self._tried.wait()
-        if self._is_router and self._failure is not None:
+        if self.is_router and self._failure is not None:
             raise self._failure
 
     async def run(self) -> None:
@@ -201,7 +201,7 @@ class ZenohWire(Wire):
         """Let `open` return, and warn; on the event loop."""
         self._tried.set()
         # The first failure of a router is raised by `open`.
-        if not (self._is_router and self._sessions == 1) and not self._stopped and self._failure is not None:
+        if not (self.is_router and self._sessions == 1) and not self._stopped and self._failure is not None:
             failure, self._failure = self._failure, None
             self._warn(failure)
 
@@ -221,7 +221,7 @@ class ZenohWire(Wire):
                 return
             session.end()
             begin_to_close(session)
-            if self._is_router:
+            if self.is_router:
                 sleep(PAUSE_TO_BEGIN)
             elif not session.broken:
                 where = self._addresses[0]
@@ -232,14 +232,14 @@ class ZenohWire(Wire):
 
     def _connect(self, channels: Iterable[str]) -> "_Session | None":
         """Try one router after the other until one answers; None if the wire is closed, or cannot listen."""
-        warns_at = monotonic() + (LONGEST_CLOSE if self._is_router else FIRST_WAIT)
+        warns_at = monotonic() + (LONGEST_CLOSE if self.is_router else FIRST_WAIT)
         while not self._stopped:
             try:
                 return self._connect_once(channels)
             except OSError as error:
                 failure = error
             self._addresses.rotate(-1)
-            if self._is_router and self._sessions == 1:
+            if self.is_router and self._sessions == 1:
                 self._failure = failure
                 self._wake()
                 return None
@@ -248,11 +248,11 @@ class ZenohWire(Wire):
                 self._failure = self._lasting(failure)
                 self._wake()
             # The session of a router before this one may not have freed the address yet.
-            self._wait(PAUSE_TO_LISTEN if self._is_router else uniform(*PAUSE) / len(self._addresses))
+            self._wait(PAUSE_TO_LISTEN if self.is_router else uniform(*PAUSE) / len(self._addresses))
         return None
 
     def _lasting(self, failure: OSError) -> OSError:
-        if self._is_router:
+        if self.is_router:
             # zenoh may never end a session in which it has panicked.
             return OSError(f"this router has no session, and goes on trying; a new process would have one: {failure}")
         where = ", ".join(sorted(self._addresses))
@@ -262,14 +262,14 @@ class ZenohWire(Wire):
 
     def _connect_once(self, channels: Iterable[str]) -> "_Session":
         self._sessions += 1
-        own = {"id": new_id()} if self._is_router else {"connect/endpoints": [self._addresses[0]]}
+        own = {"id": new_id()} if self.is_router else {"connect/endpoints": [self._addresses[0]]}
         session = _Session(self, open_session(self._config, own))
         try:
             for channel in channels:
                 session.publisher(channel)
             # The link may send something to another one as soon as that has joined.
             self._session = session
-            session.begin(self._sessions, is_router=self._is_router)
+            session.begin(self._sessions)
         except zenoh.ZError as error:
             self._session = None
             session.end()
@@ -307,7 +307,6 @@ class _Session:
         self._publishing = threading.Lock()
         self._declared: list[object] = []
         self._neighbours: Neighbours | None = None
-        self._is_router = False
         self.broken = False
         self._lock = threading.Lock()
         self._ended = False
@@ -318,14 +317,13 @@ class _Session:
 
     # For the wire
 
-    def begin(self, number: int, *, is_router: bool) -> None:
+    def begin(self, number: int) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
         session, wire, declared = self._session, self._wire, self._declared
-        self._is_router = is_router
-        if not is_router:
+        if not wire.is_router:
             declared.append(session.info.declare_transport_events_listener(_directly(self._take_event)))
         self._neighbours = Neighbours(session)
-        if is_router:
+        if wire.is_router:
             self._neighbours.announce()
         declared += self._neighbours.declared
         for index, (robots, channel) in enumerate(wire.hears):
@@ -340,14 +338,14 @@ class _Session:
             key = f"{wire.domain}/{robots_expression(robots)}/@alive/*/*"
             declared.append(liveliness.declare_subscriber(key, take, history=True))
         declared.append(liveliness.declare_token(f"{wire.own}/@alive/{wire.id}/{number}"))
-        if not is_router and not session.info.transports():
+        if not wire.is_router and not session.info.transports():
             # It broke before anybody listened.
             self.broken = True
 
     def look(self, now: float) -> float | None:
         """Tell of the links that have left by now; the s until the next look, or None to have another session."""
         # A client that is told of other links is told all, and only waits for a token on a busy machine.
-        is_told = bool(self._present) and not self._is_router
+        is_told = bool(self._present) and not self._wire.is_router
         if self.broken or (self._neighbours is not None and not is_told and self._neighbours.are_silent(now)):
             return None
         with self._lock:
