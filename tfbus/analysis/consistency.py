@@ -11,7 +11,7 @@ from tfbus.geometry.covariance import Matrix
 from tfbus.geometry.transform import Transform
 from tfbus.uncertainty import UncertainTransform
 
-_NOTHING = 1e-12
+NOTHING = 1e-12
 """A variance, as a part of the greatest one, that counts as none."""
 
 
@@ -109,7 +109,7 @@ def _of_one(answer: UncertainTransform, true: Transform) -> tuple[float, int]:
     unit[unit == 0.0] = 1.0
     values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
     along = vectors.T @ (error / unit)
-    known = values > _NOTHING
+    known = values > NOTHING
     if (np.abs(along[~known]) > 1e-9).any():
         return math.inf, int(known.sum())
     return float((along[known] ** 2 / values[known]).sum()), int(known.sum())
@@ -123,10 +123,8 @@ def _error(found: Transform, true: Transform) -> Matrix:
 
 def rotation_vector(transform: Transform) -> Matrix:
     """The axis of a rotation times its angle from 0 to pi, in rad; shape (3,)."""
-    x, y, z, w = transform.rotation
-    sine = math.hypot(x, y, z)
-    scale = 2.0 * math.atan2(sine, abs(w)) / sine * math.copysign(1.0, w) if sine else 2.0
-    return np.array([x * scale, y * scale, z * scale])
+    axis, angle = transform.as_axis_angle()
+    return angle * np.array(axis)
 
 
 def quantile(probability: float, degrees: int) -> float:

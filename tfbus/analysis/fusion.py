@@ -5,14 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tfbus.analysis.consistency import quantile, rotation_vector
+from tfbus.analysis.consistency import NOTHING, quantile, rotation_vector
 from tfbus.geometry.covariance import Covariance, Matrix, lever_arm, skew
 from tfbus.geometry.transform import Transform
 from tfbus.uncertainty import JointAnswers, UncertainTransform, joint
 
 _MOST_STEPS = 50
-_NOTHING = 1e-12
-"""A variance, as a part of the greatest one, that counts as none."""
 _TERMS = 40
 """Of the series of a Jacobian; for a rotation of pi, the last one is below 1e-25."""
 
@@ -134,7 +132,7 @@ def _weight_of(together: JointAnswers) -> Matrix:
     unit = np.sqrt(covariance.diagonal())
     unit[unit == 0.0] = 1.0
     scaled = covariance / np.outer(unit, unit)
-    if np.linalg.eigvalsh(scaled)[0] < _NOTHING:
+    if np.linalg.eigvalsh(scaled)[0] < NOTHING:
         raise ValueError(
             "in some direction an answer counts as exact, or two have the same error, so that they cannot be weighed: "
             "give each edge an error in all six directions, and each answer once"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Unpack
 
 from tfbus.geometry.covariance import Covariance, Kind, as_covariance, as_kind, covariance_of, inverse_jacobian
@@ -152,6 +152,15 @@ class UncertainSample(TransformStamped):
     def __repr__(self) -> str:
         known = super().__repr__().removeprefix("TransformStamped").removesuffix(")")
         return f"UncertainSample{known}, covariance={self.covariance!r}, kind={self.kind!r})"
+
+
+def are_uncertain(samples: Iterable[TransformStamped]) -> bool:
+    """Whether one of some samples has a covariance."""
+    # A loop, because it takes half the time of `any`.
+    for sample in samples:  # noqa: SIM110
+        if not sample._is_plain:
+            return True
+    return False
 
 
 def with_belief(sample: TransformStamped, belief: Belief) -> UncertainSample:

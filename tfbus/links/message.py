@@ -33,7 +33,6 @@ import json
 import struct
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from operator import attrgetter
 from sys import intern
 from typing import Any, NamedTuple
 
@@ -49,7 +48,7 @@ from tfbus.errors import (
 )
 from tfbus.geometry.covariance import KINDS, Covariance
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.geometry.uncertain import Belief, UncertainSample
+from tfbus.geometry.uncertain import Belief, UncertainSample, are_uncertain
 from tfbus.links.clocks import split_section
 from tfbus.links.replica import (
     Claim,
@@ -106,7 +105,6 @@ _ORIGIN = struct.Struct("<16sq")
 _BATCH, _REMOVAL, _UNCERTAIN = 0, 1, 2
 _COVARIANCE = struct.Struct("<21d")
 _UPPER = np.triu_indices(6)
-_is_plain = attrgetter("_is_plain")
 _FINAL, _PARTIAL, _HAS_TIME, _SERVES, _HAS_CLOCKS = 1, 2, 4, 8, 16
 _NO_CLOCK = -(2**63)
 _BUS = 16
@@ -300,7 +298,7 @@ def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
             2 * authorities.setdefault(authority, len(authorities)) + static
             for _, _, _, _, authority, static in (sample._fields for sample in entry.samples)
         ]
-        kind = _BATCH if all(map(_is_plain, entry.samples)) else _UNCERTAIN
+        kind = _UNCERTAIN if are_uncertain(entry.samples) else _BATCH
         body += _ENTRY.pack(kind, origin, len(tags), entry.sequence) + struct.pack(f"<{len(tags)}H", *tags)
         if kind == _UNCERTAIN:
             body += b"".join(map(_write_belief, entry.samples))

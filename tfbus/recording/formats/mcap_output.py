@@ -22,6 +22,7 @@ from typing import Any, cast
 from tfbus.bus.queues import TimedBatch
 from tfbus.errors import InvalidTransformError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.geometry.uncertain import are_uncertain
 from tfbus.recording.formats.covariances import (
     MAX_COVARIANCES,
     SUFFIX,
@@ -222,7 +223,7 @@ class McapOutput:
         self._file.close()
 
     def _write(self, topic: str, received: int, samples: Sequence[TransformStamped]) -> None:
-        uncertain = _are_uncertain(samples)
+        uncertain = are_uncertain(samples)
         if uncertain and len(samples) > MAX_COVARIANCES:
             for first in range(0, len(samples), MAX_COVARIANCES):
                 self._write(topic, received, samples[first : first + MAX_COVARIANCES])
@@ -257,15 +258,14 @@ class McapOutput:
         self._count_written()
 
     def _write_covariances(self, topic: str, log_time: int, samples: Sequence[TransformStamped]) -> None:
-        covariances = covariances_of(samples)
-        if not covariances:
-            return
         if topic not in self._covariances:
             profiles = {"offered_qos_profiles": _quality_of_service(static="static" in topic)}
             channel = covariance_channel(topic, profiles)
             schema = self._writer.register_schema(channel.type, channel.schema_encoding, channel.schema)
             self._covariances[topic] = self._writer.register_channel(topic, channel.encoding, schema, profiles)
-        self._writer.add_message(self._covariances[topic], log_time, write_covariances(covariances), log_time)
+        self._writer.add_message(
+            self._covariances[topic], log_time, write_covariances(covariances_of(samples)), log_time
+        )
 
     def _check_file(self) -> None:
         """Raise `OSError` if the file lacks data that were written, and count their samples as not written."""
@@ -281,15 +281,6 @@ class McapOutput:
             self.samples += self.buffered
             self.messages += self._buffered_messages
             self.buffered = self._buffered_messages = 0
-
-
-def _are_uncertain(samples: Sequence[TransformStamped]) -> bool:
-    """Whether one of some samples has a covariance."""
-    # A loop, because it takes half the time of `any`.
-    for sample in samples:  # noqa: SIM110
-        if not sample._is_plain:
-            return True
-    return False
 
 
 def _by_kind(batch: Batch) -> Iterable[Sequence[TransformStamped]]:
