@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from itertools import islice
 from math import inf
 from time import monotonic
@@ -489,16 +488,21 @@ class DomainEnd(Endpoint):
         return is_news
 
     def _judge(
-        self, peer: Peer, view: View, source: Provenance, samples: Iterable[FromLink], kind: Kind
+        self, peer: Peer, view: View, source: Provenance, samples: list[FromLink], kind: Kind
     ) -> tuple[bool, list[FromLink]]:
         """Note the samples of a batch; returns whether any was news for the map, and those to publish."""
         replica, live = self.relay.replica, kind is Kind.LIVE
         hides = self.drop_lost and not self.relay.reaches(source.origin)
         # The newest sample of a moving frame would make its past no news.
         waits = bool(self._history.open) and kind not in (Kind.LIVE, Kind.PAST)
-        admitted: list[FromLink] = []
-        news = False
-        for sample in samples:
+        # The usual case: the samples only continue moving frames.
+        usual = live and not hides and source.origin != self._bus and view.frames is None
+        known_so_far = replica.go_on(source, samples, view.route) if usual else 0
+        news = known_so_far > 0
+        if known_so_far == len(samples):
+            return news, samples
+        admitted = samples[:known_so_far]
+        for sample in samples[known_so_far:]:
             _, child, _, _, _, static = sample._fields
             if not view.holds(child):
                 continue
@@ -528,8 +532,11 @@ class DomainEnd(Endpoint):
     def _publish(self, samples: list[FromLink], kind: Kind) -> None:
         """Publish some samples, and empty their list."""
         if samples and not self.bus.closed:
-            with nullcontext() if kind is Kind.LIVE else self.bus._kept_samples():
+            if kind is Kind.LIVE:
                 self.bus.publish(samples, invalid="drop")
+            else:
+                with self.bus._kept_samples():
+                    self.bus.publish(samples, invalid="drop")
             self.samples += len(samples)
         samples.clear()
 

@@ -128,6 +128,7 @@ class Kind(enum.IntEnum):
     LOOKUP_ANSWER = 9
 
 
+_KINDS = {kind.value: kind for kind in Kind}
 TEXTS = frozenset({Kind.QUESTION, Kind.PAST_QUESTION, Kind.LOOKUP, Kind.LOOKUP_ANSWER})
 
 
@@ -353,12 +354,7 @@ class _Head(NamedTuple):
 
 def kind_of(data: bytes) -> Kind | None:
     """The kind of a message; None if it is of no known kind or version."""
-    if len(data) < 2 or data[0] != VERSION:
-        return None
-    try:
-        return Kind(data[1])
-    except ValueError:
-        return None
+    return _KINDS.get(data[1]) if len(data) >= 2 and data[0] == VERSION else None
 
 
 def split_clocks(data: bytes) -> tuple[bytes, bytes]:
@@ -415,7 +411,7 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
             yield heard
             size, heard = 0, replace(heard, time=None, entries=[], errors=[], continues=True, goes_on=False)
         if isinstance(entry, ReceivedBatch):
-            entry.samples = [sample for sample in samples[place : place + count] if sample is not None]
+            entry.samples = [*filter(None, samples[place : place + count])]
             place += count
         size += 1 + count
         heard.entries.append(entry)
@@ -457,12 +453,14 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, _Head]:
         at += _BUS * (length + 1) + 1
     origins = [_ORIGIN.unpack_from(data, at + _ORIGIN.size * k) for k in range(origin_count)]
     at += _ORIGIN.size * origin_count
-    authorities = []
+    # The tags by the numbers that samples have for them.
+    named: list[tuple[str, bool]] = []
     for _ in range(authority_count):
         (length,) = _LENGTH.unpack_from(data, at)
         at += _LENGTH.size
         # All messages share one string for each authority: it may be long, and each sample keeps it.
-        authorities.append(intern(data[at : at + length].decode()))
+        authority = intern(data[at : at + length].decode())
+        named += (authority, False), (authority, True)
         at += length
     entries: list[tuple[ReceivedBatch | RemovedFrame, int]] = []
     tags: list[tuple[str, bool]] = []
@@ -480,7 +478,7 @@ def _read_head(kind: Kind, data: bytes) -> Generator[None, None, _Head]:
             first = len(tags)
             if first + size > MAX_SAMPLES:
                 raise MalformedMessageError("oversized", f"a message of more than {MAX_SAMPLES} samples")
-            tags += [(authorities[tag >> 1], bool(tag & 1)) for tag in struct.unpack_from(f"<{size}H", data, at)]
+            tags += map(named.__getitem__, struct.unpack_from(f"<{size}H", data, at))
             at += 2 * size
             for place in range(first, first + size) if entry_kind == _UNCERTAIN else ():
                 belief, at = _read_belief(data, at)

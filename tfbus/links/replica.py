@@ -421,6 +421,31 @@ class Replica:
                 self.discard(self.entries[self._removals[0][1]])
         return True
 
+    def go_on(self, source: Provenance, samples: "Sequence[FromLink]", route: "tuple[View, ...]") -> int:
+        """Take in the first samples of a live batch, as far as they only continue moving frames of the batch's origin.
+
+        Most samples do. For those, this has the effects of `note`, `Relay.is_news` and `Relay.admit`.
+
+        Returns
+        -------
+        int
+            How many were taken in; all of them are news for the bus.
+        """
+        entries, fresh = self.entries, self._fresh
+        origin, sequence = source.origin, source.sequence
+        for count, sample in enumerate(samples):
+            _, child, _, _, _, static = sample._fields
+            known = entries.get(child)
+            if static or known is None or known.sample is None or known.passed or known.route is not route:
+                return count
+            last, numbers = known.source, known.numbers
+            if last.origin != origin or last.sequence >= sequence or origin not in numbers:
+                return count
+            known.source, known.sample, numbers[origin] = source, sample, sequence
+            sample._provenance = source
+            fresh[child] = None
+        return len(samples)
+
     def widen(self, known: Known, views: "Iterable[View]") -> None:
         """Let an entry be in some views too."""
         new = [view for view in views if view not in known.views and view.holds(known.frame)]
@@ -530,6 +555,7 @@ class View:
 
     Attributes
     ----------
+    frames : frozenset of str or None
     digest : int
         The digest of its settled entries.
     route : tuple of View
@@ -538,13 +564,13 @@ class View:
 
     def __init__(self, replica: Replica, frames: frozenset[str] | None = None) -> None:
         self._replica = replica
-        self._frames = frames
+        self.frames = frames
         self.digest = 0
         self.route: tuple[View, ...] = (self,)
 
     def holds(self, frame: str) -> bool:
         """Whether a frame may be in it."""
-        return self._frames is None or frame in self._frames
+        return self.frames is None or frame in self.frames
 
     def claim(self, now: float, frames: Collection[str] | None = None) -> Claim:
         """The sequence and the digest of the view, or of the part of it that is about some frames."""
@@ -555,7 +581,7 @@ class View:
             for known in filter(None, map(self._replica.entries.get, frames)):
                 if self in known.views:
                     digest ^= known.digest
-        return Claim(self._replica.sequence, self._replica.sequence, digest, partial=self._frames is not None)
+        return Claim(self._replica.sequence, self._replica.sequence, digest, partial=self.frames is not None)
 
     def changes(
         self, since: int, now: float, frames: Collection[str] | None = None, limit: int = CHUNK

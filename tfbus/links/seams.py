@@ -139,7 +139,7 @@ class Wire(Protocol):
 # Both kinds of links
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(eq=False, slots=True)
 class Received:
     """One item that has come.
 
