@@ -442,7 +442,7 @@ class Replica:
             if last.origin != origin or last.sequence >= sequence or origin not in numbers:
                 return count
             known.source, known.sample, numbers[origin] = source, sample, sequence
-            sample._provenance = source
+            sample._provenance = source  # type: ignore[misc]
             fresh[child] = None
         return len(samples)
 
