@@ -5,6 +5,7 @@ import pickle
 import struct
 from collections.abc import Callable, Sequence
 from itertools import count
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -18,7 +19,7 @@ from support.samples import moving, static
 from tfbus import SECOND, Buffer, Bus, PeerLost, SimulatedClock, TransformStamped
 from tfbus.links.message import Kind
 from tfbus.links.relay import MOST_PASSED
-from tfbus.links.replica import ReceivedTransform
+from tfbus.links.replica import OutgoingBatch, ReceivedTransform, RemovedFrame, Replica
 from tfbus.tf_message import decode, encode
 
 Graph = Sequence[Sequence[int]]
@@ -426,3 +427,56 @@ def test_so_many_samples_of_each_frame_are_remembered_and_some_of_a_frame_that_w
     beside.process.remove("a")
     assert not beside.is_news(moving("map", "a", MOST_PASSED + 1))
     assert beside.is_news(moving("map", "a", 3))
+
+
+# Batches that go on
+
+
+@pytest.mark.parametrize("links", [1, 2])
+@pytest.mark.parametrize("options", [{}, {"drop_lost": True}, {"frames": {"a", "b"}}], ids=str)
+def test_a_batch_that_only_goes_on_is_taken_as_each_of_its_samples_would_be(
+    options: dict[str, Any], links: int
+) -> None:
+    def run(seed: int) -> object:
+        world = World(seed)
+        networks = [Network(world) for _ in range(links)]
+        process = world.process(*networks, **options)
+        strangers = [Stranger(network, bus=b"a stranger's bus") for network in networks]
+        replica, draw = process.end.relay.replica, world.random
+        origins = [strangers[0].bus, strangers[0].bus, b"one more origin.", replica.origin]
+        reaches = [(b"one more origin.", ())]
+        world.run(0.01)
+        for step in range(60):
+            frames = draw.sample("abcd", draw.randint(1, 3)) + draw.choices("ab", k=draw.random() < 0.2)
+            kinds = draw.choices((moving, static), (9, 1), k=len(frames))
+            samples = [
+                kind("map", frame, stamp=draw.randint(0, step)) for kind, frame in zip(kinds, frames, strict=True)
+            ]
+            origin, number = draw.choice(origins), 10**6 + step + draw.randint(-4, 1)
+            stranger = draw.choice(strangers)
+            match draw.choices(("live", "answer", "removal", "own", "own removal", "reach"), (14, 2, 2, 2, 1, 1))[0]:
+                case "own":
+                    process.say(*samples)
+                case "own removal":
+                    process.remove(frames[0])
+                case "reach":
+                    stranger.say(kind=Kind.SIGN, reach=reaches[: draw.randint(0, 1)])
+                case "removal":
+                    stranger.say(RemovedFrame(origin, number, frames[0]))
+                case kind:
+                    stranger.say(OutgoingBatch(origin, number, samples), kind=Kind[kind.upper()])
+        entries = {
+            frame: (one.source.rank, one.sample, one.shown and one.shown.rank, one.floor, one.numbers, one.passed)
+            for frame, one in replica.entries.items()
+        }
+        names = [view for end in process.domain_ends for view in end.views.values()]
+        views = {frame: [names.index(view) for view in one.views] for frame, one in replica.entries.items()}
+        told = process.end.own.claim(world.now + 10.0).digest, process.end.duplicates
+        return entries, views, replica._held, replica._removals, told, process.batches, process.removed
+
+    with pytest.MonkeyPatch.context() as patch:
+        # The numbers that this bus gives lie among those of the stranger.
+        patch.setattr("tfbus.links.relay.time_ns", lambda: 10**9)
+        found = [run(seed) for seed in range(8)]
+        patch.setattr(Replica, "go_on", lambda *_: 0)
+        assert found == [run(seed) for seed in range(8)]

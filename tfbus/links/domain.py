@@ -44,6 +44,7 @@ from tfbus.links.replica import (
     RemovedFrame,
     TooManyEntriesError,
     View,
+    as_told,
 )
 from tfbus.links.seams import Hearing, Joined, Left, Received, Wire, WireItem
 from tfbus.stamps import SECOND, as_duration, to_seconds
@@ -276,9 +277,9 @@ class DomainEnd(Endpoint):
         claim, clocks = self.own.claim(self._now()), self.clocks.section(answers=False)
         serves = self.lookups.server is not None
         out = Outgoing(Kind.MEETING, self._bus, 0, claim, self.time, self._reach(), serves, clocks)
-        entries = [known.told for known in islice(self.own.brought(self), CHUNK + 1)]
+        brought = [*islice(self.own.brought(self), CHUNK + 1)]
         try:
-            message = write_message(out, entries if len(entries) <= CHUNK else ())
+            message = write_message(out, as_told(brought) if len(brought) <= CHUNK else ())
         except ValueError:
             message = write_message(out)
         self._wire.send(peer.id, message)
@@ -496,13 +497,9 @@ class DomainEnd(Endpoint):
         # The newest sample of a moving frame would make its past no news.
         waits = bool(self._history.open) and kind not in (Kind.LIVE, Kind.PAST)
         # The usual case: the samples only continue moving frames.
-        usual = live and not hides and source.origin != self._bus and view.frames is None
-        known_so_far = replica.go_on(source, samples, view.route) if usual else 0
-        news = known_so_far > 0
-        if known_so_far == len(samples):
-            return news, samples
-        admitted = samples[:known_so_far]
-        for sample in samples[known_so_far:]:
+        count = replica.go_on(source, samples, view.route) if live and not hides else 0
+        admitted, news = samples[:count], count > 0
+        for sample in samples[count:]:
             _, child, _, _, _, static = sample._fields
             if not view.holds(child):
                 continue

@@ -70,9 +70,9 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
-from itertools import islice
+from itertools import groupby, islice
 from math import inf
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from random import uniform
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -296,13 +296,20 @@ class Known:
     sequence: int = 0
     digest: int = 0
 
-    @property
-    def told(self) -> Entry:
-        """As it goes into a message."""
-        if self.sample is None:
-            return RemovedFrame(self.source.origin, self.source.sequence, self.frame)
-        source = self.source
-        return OutgoingBatch(source.origin, source.sequence, (self.sample,), source.clock, source.shift)
+
+def as_told(entries: Iterable[Known]) -> list[Entry]:
+    """Some entries as they go into a message, in their order: a batch for each run of samples of one source."""
+    told: list[Entry] = []
+    for source, run in groupby(entries, attrgetter("source")):
+        samples = []
+        for known in run:
+            if known.sample is None:
+                told.append(RemovedFrame(source.origin, source.sequence, known.frame))
+            else:
+                samples.append(known.sample)
+        if samples:
+            told.append(OutgoingBatch(source.origin, source.sequence, samples, source.clock, source.shift))
+    return told
 
 
 class Claim(NamedTuple):
@@ -424,12 +431,13 @@ class Replica:
     def go_on(self, source: Provenance, samples: "Sequence[FromLink]", route: "tuple[View, ...]") -> int:
         """Take in the first samples of a live batch, as far as they only continue moving frames of the batch's origin.
 
-        Most samples do. For those, this has the effects of `note`, `Relay.is_news` and `Relay.admit`.
+        Most samples do. This has the effect of `note`, and the samples are news for the bus. The view has their frames
+        already, because its route has brought the known samples.
 
         Returns
         -------
         int
-            How many were taken in; all of them are news for the bus.
+            How many were taken in.
         """
         entries, fresh = self.entries, self._fresh
         origin, sequence = source.origin, source.sequence
@@ -438,11 +446,10 @@ class Replica:
             known = entries.get(child)
             if static or known is None or known.sample is None or known.passed or known.route is not route:
                 return count
-            last, numbers = known.source, known.numbers
-            if last.origin != origin or last.sequence >= sequence or origin not in numbers:
+            last = known.source
+            if last.origin != origin or last.sequence >= sequence:
                 return count
-            known.source, known.sample, numbers[origin] = source, sample, sequence
-            sample._provenance = source  # type: ignore[misc]
+            known.source, known.sample = source, sample
             fresh[child] = None
         return len(samples)
 
@@ -555,7 +562,6 @@ class View:
 
     Attributes
     ----------
-    frames : frozenset of str or None
     digest : int
         The digest of its settled entries.
     route : tuple of View
@@ -564,13 +570,13 @@ class View:
 
     def __init__(self, replica: Replica, frames: frozenset[str] | None = None) -> None:
         self._replica = replica
-        self.frames = frames
+        self._frames = frames
         self.digest = 0
         self.route: tuple[View, ...] = (self,)
 
     def holds(self, frame: str) -> bool:
         """Whether a frame may be in it."""
-        return self.frames is None or frame in self.frames
+        return self._frames is None or frame in self._frames
 
     def claim(self, now: float, frames: Collection[str] | None = None) -> Claim:
         """The sequence and the digest of the view, or of the part of it that is about some frames."""
@@ -581,7 +587,7 @@ class View:
             for known in filter(None, map(self._replica.entries.get, frames)):
                 if self in known.views:
                     digest ^= known.digest
-        return Claim(self._replica.sequence, self._replica.sequence, digest, partial=self.frames is not None)
+        return Claim(self._replica.sequence, self._replica.sequence, digest, partial=self._frames is not None)
 
     def changes(
         self, since: int, now: float, frames: Collection[str] | None = None, limit: int = CHUNK
@@ -593,13 +599,13 @@ class View:
         """
         if since > self._replica.sequence:
             since = 0
-        found: list[Entry] = []
+        found: list[Known] = []
         for known in self._replica.changes(since, now):
             if self in known.views and (frames is None or known.frame in frames):
-                found.append(known.told)
+                found.append(known)
                 if len(found) == limit and known.sequence < self._replica.sequence:
-                    return found, Claim(since, known.sequence, 0, final=False)
-        return found, self.claim(now, frames)._replace(since=since)
+                    return as_told(found), Claim(since, known.sequence, 0, final=False)
+        return as_told(found), self.claim(now, frames)._replace(since=since)
 
     def brought(self, outbox: object) -> Iterator[Known]:
         """The frames of it that a link itself brings to the domain: they came from the bus, and not by this link."""
