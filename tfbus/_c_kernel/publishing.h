@@ -305,11 +305,19 @@ intake_init(Intake *self, PyObject *args, PyObject *kwargs)
     return 0;
 }
 
-/* A batch of samples of exactly the class; NULL without an error for anything else. */
+/* Whether something is a sample that knows nothing beyond its fields, such as one that came over a link. */
+static int
+is_plain_sample(const Intake *self, PyObject *item)
+{
+    return OBJECT(Py_TYPE(item)) == self->kind
+        || (PyObject_TypeCheck(item, SampleType) && ((Sample *)item)->authority != NULL && !knows_more((Sample *)item));
+}
+
+/* A batch of such samples; NULL without an error for anything else. */
 static PyObject *
 intake_batch(const Intake *self, PyObject *samples)
 {
-    if (OBJECT(Py_TYPE(samples)) == self->kind) {
+    if (is_plain_sample(self, samples)) {
         return PyTuple_Pack(1, samples);
     }
     PyObject *batch = NULL;
@@ -324,7 +332,7 @@ intake_batch(const Intake *self, PyObject *samples)
     }
     const Py_ssize_t size = batch == NULL ? 0 : PyTuple_Size(batch);
     for (Py_ssize_t i = 0; i < size; i++) {
-        if (OBJECT(Py_TYPE(PyTuple_GetItem(batch, i))) != self->kind) {
+        if (!is_plain_sample(self, PyTuple_GetItem(batch, i))) {
             Py_DECREF(batch);
             return NULL;
         }
