@@ -174,13 +174,7 @@ class SampleQueue:
 
 
 def _count_moving(samples: Iterable[TransformStamped]) -> int:
-    # A plain loop over the fields: streams count each batch of the bus twice.
-    count = 0
-    for sample in samples:
-        _, _, _, _, _, static = sample._fields
-        if not static:
-            count += 1
-    return count
+    return len([sample for sample in samples if not sample.static])
 
 
 class Stream(OneReaderStream[Batch]):

@@ -141,10 +141,11 @@ class Channels:
                 newest.pop(entry.frame, None)
                 continue
             for sample in entry.samples:
-                fields = sample._fields
-                newest.pop(fields[1], None)
-                if not fields[5]:
-                    newest[fields[1]] = OutgoingBatch(entry.origin, entry.sequence, (sample,), entry.clock, entry.shift)
+                newest.pop(sample.child, None)
+                if not sample.static:
+                    newest[sample.child] = OutgoingBatch(
+                        entry.origin, entry.sequence, (sample,), entry.clock, entry.shift
+                    )
 
     def _write(self, channel: _Channel, entries: Sequence[Entry]) -> None:
         """One message of all entries if possible, else several; a batch that is too large is left out and reported."""

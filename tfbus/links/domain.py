@@ -425,7 +425,7 @@ class DomainEnd(Endpoint):
         source.clock = self.clocks.goes_on(peer.id, entry.origin, entry.clock)
         if source.clock is not None:
             return False
-        moving = [sample for sample in entry.samples if not sample._fields[5]]
+        moving = [sample for sample in entry.samples if not sample.static]
         self._correct(peer, source, moving, direct=entry.origin == heard.bus)
         is_live = heard.kind is Kind.LIVE and bool(moving)
         return is_live and self.clocks.jumps(peer.id, entry.origin, entry.clock, source.clock, source.shift)
@@ -433,7 +433,7 @@ class DomainEnd(Endpoint):
     def _correct(self, peer: Peer, source: Provenance, moving: Sequence[FromLink], *, direct: bool = False) -> None:
         """Find the clock of a source, and if stamps are to be corrected, move those of its samples, which are new."""
         source.clock, shift = self.clocks.place(peer.id, source.told, direct=direct)
-        if shift and all(FIRST_STAMP <= sample._fields[2] + shift < END_OF_STAMPS for sample in moving):
+        if shift and all(FIRST_STAMP <= sample.stamp + shift < END_OF_STAMPS for sample in moving):
             source.shift = shift
             for sample in moving:
                 parent, child, stamp, row, authority, static = sample._fields
@@ -500,7 +500,7 @@ class DomainEnd(Endpoint):
         count = replica.go_on(source, samples, view.route) if live and not hides else 0
         admitted, news = samples[:count], count > 0
         for sample in samples[count:]:
-            _, child, _, _, _, static = sample._fields
+            child, static = sample.child, sample.static
             if not view.holds(child):
                 continue
             moves = live and not static

@@ -259,7 +259,7 @@ class Endpoint(Outbox, ABC):
 
     def _admit_authorities(self, peer: Peer, samples: Collection[TransformStamped]) -> bool:
         """Note the authorities of a batch; returns False, and refuses the batch, if they are too many."""
-        for authority in {sample._fields[4] for sample in samples} - peer.authorities:
+        for authority in {sample.authority for sample in samples} - peer.authorities:
             text = peer.authority_text + len(authority)
             if len(peer.authorities) >= MAX_AUTHORITIES or text > MOST_AUTHORITY_TEXT:
                 why = f"the peer has spoken for more than {MAX_AUTHORITIES} authorities, or for very long ones"

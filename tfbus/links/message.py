@@ -251,16 +251,15 @@ def sendable(entry: Entry, refuse: Callable[[str, Exception], object]) -> Entry 
 
 def can_hold(sample: TransformStamped) -> bool:
     """Whether a message can hold a sample."""
-    parent, child, stamp, _, authority, _ = sample._fields
     # The same names come again with each sample of a frame.
-    names = parent, child, authority
+    names = sample.parent, sample.child, sample.authority
     if names in _HELD:
-        return FIRST_STAMP <= stamp < END_OF_STAMPS
+        return FIRST_STAMP <= sample.stamp < END_OF_STAMPS
     if reason_not_to_send(sample) is not None:
         return False
     if len(_HELD) >= _MOST_HELD:
         _HELD.clear()
-    if len(authority) < _MOST_HELD:
+    if len(sample.authority) < _MOST_HELD:
         _HELD.add(names)
     return True
 
@@ -296,8 +295,7 @@ def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
             body += _ENTRY.pack(_REMOVAL, origin, len(name), entry.sequence) + name
             continue
         tags = [
-            2 * authorities.setdefault(authority, len(authorities)) + static
-            for _, _, _, _, authority, static in (sample._fields for sample in entry.samples)
+            2 * authorities.setdefault(sample.authority, len(authorities)) + sample.static for sample in entry.samples
         ]
         kind = _UNCERTAIN if are_uncertain(entry.samples) else _BATCH
         body += _ENTRY.pack(kind, origin, len(tags), entry.sequence) + struct.pack(f"<{len(tags)}H", *tags)

@@ -250,7 +250,7 @@ class Relay:
 
     def is_news(self, known: Known, sample: TransformStamped, source: Provenance) -> bool:
         """Whether the bus has not heard a sample before, and shows nothing newer that rules it out."""
-        static, rank, shown = sample._fields[5], source.rank, known.shown
+        static, rank, shown = sample.static, source.rank, known.shown
         # A static one has to be ranked, so that all buses agree in the end.
         if rank < known.floor or (known.passed and not static and _key(sample) in known.passed):
             return False
@@ -263,7 +263,7 @@ class Relay:
         """Take the news of one batch for heard, which are to be published next."""
         for sample in news:
             sample._provenance = source  # type: ignore[misc]
-            numbers = self.replica.entries[sample._fields[1]].numbers
+            numbers = self.replica.entries[sample.child].numbers
             numbers[source.origin] = source.sequence
             if len(numbers) > MOST_ORIGINS:
                 oldest = min(filter(None, numbers), key=numbers.__getitem__)
@@ -375,7 +375,7 @@ class Relay:
                 source = Provenance(self.replica.origin, self.next_number(), clock=self.clock.base())
             samples = tuple(group)
             for sample in samples:
-                child = sample._fields[1]
+                child = sample.child
                 known = entries.get(child)
                 # A link has noted what it brings.
                 if known is None or known.source is not source or source.outbox is None:
@@ -440,8 +440,7 @@ def _source_of(sample: TransformStamped) -> Provenance | None:
 
 
 def _key(sample: TransformStamped) -> tuple[str, int, Row | None]:
-    parent, _, stamp, row, _, static = sample._fields
-    return parent, stamp, row if static else None
+    return sample.parent, sample.stamp, sample._row if sample.static else None
 
 
 def _remember(known: Known, sample: TransformStamped) -> None:

@@ -141,7 +141,7 @@ class OutgoingBatch:
         """The part of it that is about some frames; None if it has none."""
         if frames is None:
             return self
-        samples = tuple(sample for sample in self.samples if sample._fields[1] in frames)
+        samples = tuple(sample for sample in self.samples if sample.child in frames)
         return OutgoingBatch(self.origin, self.sequence, samples, self.clock, self.shift) if samples else None
 
     def uncorrected(self) -> Sequence[TransformStamped]:
@@ -442,9 +442,9 @@ class Replica:
         entries, fresh = self.entries, self._fresh
         origin, sequence = source.origin, source.sequence
         for count, sample in enumerate(samples):
-            _, child, _, _, _, static = sample._fields
+            child = sample.child
             known = entries.get(child)
-            if static or known is None or known.sample is None or known.passed or known.route is not route:
+            if sample.static or known is None or known.sample is None or known.passed or known.route is not route:
                 return count
             last = known.source
             if last.origin != origin or last.sequence >= sequence:
