@@ -433,7 +433,7 @@ def test_so_many_samples_of_each_frame_are_remembered_and_some_of_a_frame_that_w
 
 
 @pytest.mark.parametrize("links", [1, 2])
-@pytest.mark.parametrize("options", [{}, {"drop_lost": True}, {"frames": {"a", "b"}}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"drop_lost": True}, {"frames": ["a", "b"]}], ids=str)
 def test_a_batch_that_only_goes_on_is_taken_as_each_of_its_samples_would_be(
     options: dict[str, Any], links: int
 ) -> None:
