@@ -100,7 +100,7 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
     ),
     (
         ClockOffset(AT, "tf", "5eed", (), -0.01, 0.0002, over=True),
-        "peer 5eed runs 10 ms behind this clock, within 200 us: peer 5eed on tf, which is near enough",
+        "peer 5eed runs 10 ms behind this clock, within 200 us: on tf, which is near enough",
     ),
     (
         PeerClockStepped(AT, "tf", "5eed", -1.0, ("odom", "tool")),

@@ -569,8 +569,9 @@ class ClockOffset(PlainData):
 
     def __str__(self) -> str:
         clock = PeerClock(self.peer, self.authorities, self.offset, self.bound)
-        end = ", which is near enough" if self.over else ""
-        return _line(self.stamp, f"{clock}: peer {self.peer} on {self.link}{end}")
+        # Without authorities, the clock is named by its peer.
+        where = f"peer {self.peer} on {self.link}" if self.authorities else f"on {self.link}"
+        return _line(self.stamp, f"{clock}: {where}{', which is near enough' if self.over else ''}")
 
 
 @dataclass(frozen=True, slots=True)

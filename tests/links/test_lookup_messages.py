@@ -42,13 +42,6 @@ def test_a_question_is_read_as_it_was_written(message: RemoteQuestion) -> None:
     assert read_question(write_question(message)) == message
 
 
-def test_a_question_without_covariance_is_one_that_older_servers_read() -> None:
-    assert json.loads(write_question(RemoteQuestion("map", "base", 7))).keys() == {
-        *("type", "target", "source", "at", "timeout", "max_age"),
-        *("source_at", "fixed", "tolerance", "max_gap", "hold"),
-    }
-
-
 def test_so_large_a_message_is_read_and_no_larger_one() -> None:
     largest = write_question(QUESTION).ljust(MAX_TEXT)
     assert read_question(largest) == QUESTION

@@ -407,27 +407,6 @@ async def test_whatever_a_server_answers_a_lookup_has_its_answer_or_a_remote_loo
             assert again.answer == FOUND
 
 
-@pytest.mark.parametrize(
-    "answer",
-    [
-        write_answer(FOUND),
-        write_answer(RemoteLookupError(domain="tf", robot="r1", reason="malformed", detail="no field 'covariance'")),
-    ],
-)
-async def test_a_server_that_knows_no_covariances_is_told_from_one_without_an_answer(answer: bytes) -> None:
-    network = MemoryNetwork()
-    with Bus() as bus:
-        async with DomainLink(bus, "tf", network.wire()) as asker, anyio.create_task_group() as tasks:
-            stranger = Stranger(network)
-            await stranger.open()
-            waiting = Asked(tasks, lambda: asker.lookup("map", "base", 7, robot="r1", covariance=True))
-            await until(lambda: bool(stranger.bodies))
-            stranger.say(asker.id, Kind.LOOKUP_ANSWER, stranger.bodies[0][1][:8] + answer)
-            await until(lambda: waiting.ended)
-            assert isinstance(waiting.error, RemoteLookupError)
-            assert "a server of an older version knows no covariances: ask it without them" in str(waiting.error)
-
-
 async def test_what_is_no_question_is_refused_and_counted_and_harms_nobody() -> None:
     async with asked() as scene:
         scene.bus.publish(static("map", "base"))

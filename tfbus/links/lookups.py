@@ -213,8 +213,6 @@ class RemoteLookups:
             raise self._error(robot, "lost", "it has gone" if self._is_open else "this link has ended")
         answer = read_answer(pending.answer, self._domain, robot, question)
         if isinstance(answer, Exception):
-            if question.covariance and isinstance(answer, RemoteLookupError) and answer.reason == "malformed":
-                answer.detail += "; a server of an older version knows no covariances: ask it without them"
             raise answer
         return answer
 

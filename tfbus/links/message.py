@@ -535,11 +535,7 @@ class RemoteQuestion(PlainData):
 
 def write_question(question: RemoteQuestion) -> bytes:
     """The bytes of a question."""
-    fields = question.to_dict()
-    if not question.covariance:
-        # A server of an older version knows no such field.
-        del fields["covariance"]
-    return json.dumps(fields).encode()
+    return json.dumps(question.to_dict()).encode()
 
 
 def read_question(data: bytes) -> RemoteQuestion:
@@ -555,7 +551,7 @@ def read_question(data: bytes) -> RemoteQuestion:
         if isinstance(value, str) and len(value.encode()) > MAX_NAME:
             raise ValueError(f"its field {_shown(name)} has more than {MAX_NAME} bytes")
     try:
-        return RemoteQuestion.from_dict({"covariance": False, **fields})
+        return RemoteQuestion.from_dict(fields)
     except ValueError as error:
         raise ValueError(str(error)[:_SHOWN]) from None
 
