@@ -92,6 +92,12 @@ class LocalWire(Wire):
     loopback : bool, optional
         Whether to use ports of the loopback instead of Unix sockets; by default only where there are none, as on
         Windows. All links of a domain have to use the same.
+
+    Attributes
+    ----------
+    turn : callable
+        Calls the function that it gets, which receives for one turn of the event loop. A link has what was received
+        handled in the same turn.
     """
 
     # A connection drops only the oldest waiting messages, so the last one before a silence arrives.
@@ -108,6 +114,7 @@ class LocalWire(Wire):
         self._connections: dict[Connection, None] = {}
         self._links: dict[str, Connection] = {}
         self._budget = TurnBudget()
+        self.turn: Callable[[Callable[[], object]], object] = lambda receive: receive()
         self._ready: deque[tuple[SelectorKey, int]] = deque()
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
@@ -119,7 +126,7 @@ class LocalWire(Wire):
 
     async def run(self) -> None:
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(self._poll.run, self._serve)
+            tasks.start_soon(self._poll.run, lambda: self.turn(self._serve))
             tasks.start_soon(self._meet)
 
     def is_heard(self, channel: str) -> bool:
