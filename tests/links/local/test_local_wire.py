@@ -549,9 +549,9 @@ async def test_links_work_where_the_system_has_no_poll_object_that_is_a_file(
     large = bytes(1_000_000)
     one = LocalWire(DOMAIN, directory=directory, loopback=loopback)
     async with running(one) as ear:
-        async with pair(directory, loopback) as (two, _, three, _):
-            await ear.joined(two.id)
-            await ear.joined(three.id)
+        async with pair(directory, loopback) as (two, ear_two, three, ear_three):
+            await ear_two.joined(one.id)
+            await ear_three.joined(one.id)
             assert two.send(one.id, large)
             assert three.is_heard("all")
             three.publish("all", b"to all")
