@@ -20,8 +20,8 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.rows import IDENTITY, Row, Vector, compose, invert, rotate
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps
+from tfbus.rows import IDENTITY, RawColumns, Row, Vector, compose, invert, rotate
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Place, Stamps
 
 SampleT = TypeVar("SampleT", bound="Sample")
 
@@ -156,10 +156,6 @@ class Judge:
             if known.newest is None or fields[2] > known.newest:
                 known.newest = fields[2]
         return True
-
-
-Place = tuple[int, int, Any]
-"""The place of a parked lookup in a sorted list: -stamp, -order, and the lookup."""
 
 
 class Parked:
@@ -354,10 +350,6 @@ _pack = _RECORD.pack
 _unpack = _RECORD.unpack_from
 _unpack_pair = struct.Struct("q7dq7d").unpack_from
 
-Columns = tuple[Any, int, Any, int, int, int]
-"""A buffer and the byte at which stamps begin in it; a buffer and the byte at which rows begin; their width, the
-number of floats from one row to the next (the last seven are the row); and the number of samples."""
-
 
 class History:
     """The moving samples of one edge in its window, in the order of their stamps. The oldest has the index 0.
@@ -541,7 +533,7 @@ class History:
         self._settle()
         self._cut_after = other._cut_after
 
-    def columns(self, first: int, end: int, wanted: Stamps | None = None) -> Columns:
+    def columns(self, first: int, end: int, wanted: Stamps | None = None) -> RawColumns:
         """The memory of the samples from one index to another, which nothing changes while it is held.
 
         Samples that are not next to a `wanted` stamp (ns) may be left out.

@@ -25,7 +25,6 @@ Each error keeps its facts as attributes and builds its message from them, so pr
 can be pickled and copied, with their cause. Arguments of the wrong type raise `TypeError`, as everywhere in Python.
 """
 
-import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from heapq import nlargest
@@ -206,6 +205,9 @@ class UnknownFrameError(TransformLookupError):
 # Many lookups may wait for one frame, and each has its own error.
 @lru_cache(maxsize=128)
 def _close_matches(frame: str, known: tuple[str, ...]) -> tuple[str, ...]:
+    # Few processes show such an error.
+    from difflib import get_close_matches
+
     length = len(frame)
     if length > LONGEST_NAME:
         return ()
@@ -219,7 +221,7 @@ def _close_matches(frame: str, known: tuple[str, ...]) -> tuple[str, ...]:
     # A comparison of long names takes up to 2 ms.
     most = max(3, min(LOOKED_AT, 10_000 // max(length, 1) ** 2))
     candidates = short if len(short) <= most else nlargest(most, short, likeness)
-    return tuple(difflib.get_close_matches(frame, candidates))
+    return tuple(get_close_matches(frame, candidates))
 
 
 class DisconnectedError(TransformLookupError):

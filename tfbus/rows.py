@@ -29,6 +29,10 @@ IDENTITY: Row = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 Columns: TypeAlias = tuple[Any, Any, Any, Any, Any, Any, Any]
 """Many rows as seven columns: each an array, or a float if all rows have the same number there."""
 
+RawColumns: TypeAlias = tuple[Any, int, Any, int, int, int]
+"""A buffer and the byte at which stamps begin in it; a buffer and the byte at which rows begin; their width, the
+number of floats from one row to the next (the last seven are the row); and the number of samples."""
+
 
 @overload
 def compose(a: Row, b: Row) -> Row: ...

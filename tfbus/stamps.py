@@ -30,6 +30,9 @@ StampsLike: TypeAlias = npt.ArrayLike | Sequence[StampLike]
 Stamps = npt.NDArray[np.int64]
 """An array of stamps in ns, shape (n,)."""
 
+Place = tuple[int, int, Any]
+"""The place of a parked lookup in a sorted list: -stamp, -order, and the lookup."""
+
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _DAY = 86_400 * SECOND
 _YEAR = 365 * _DAY

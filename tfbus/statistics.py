@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from html import escape
 from typing import Any
 
 from tfbus.plain import PlainData, printable
@@ -24,6 +23,9 @@ class Counts(PlainData):
         return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in self._counted().items())})"
 
     def _repr_html_(self) -> str:
+        # Few processes show a page, and the names of all entities take memory.
+        from html import escape
+
         cells = (f"<tr><th>{name}</th><td>{escape(str(value))}</td></tr>" for name, value in self._counted().items())
         return f"<table><caption>{type(self).__name__}</caption>{''.join(cells)}</table>"
 

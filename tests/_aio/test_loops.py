@@ -38,6 +38,28 @@ async def test_a_callback_that_raises_is_logged_and_ends_nothing(caplog: pytest.
     assert answers == [0, 1]
 
 
+async def test_requests_of_work_on_the_loop_are_answered_at_its_end_and_later_ones_later() -> None:
+    done: list[str] = []
+    waker = LoopWaker(lambda: done.append("answer"))
+    waker.bind()
+
+    def work() -> None:
+        waker.wake()
+        thread = Thread(target=waker.wake)
+        thread.start()
+        thread.join()
+        done.append("work")
+
+    waker.answer(work)
+    assert done == ["work", "answer"]
+    with pytest.raises(ZeroDivisionError):
+        waker.answer(lambda: 1 // 0)
+    waker.wake()
+    assert len(done) == 3
+    await settle()
+    assert len(done) == 4
+
+
 def test_waking_in_a_thread_while_the_loop_ends_raises(run: Run) -> None:
     waker = LoopWaker(list)
     begun = threading.Event()

@@ -183,6 +183,15 @@ class LoopWaker:
         elif self._loop_is_closed():
             raise RuntimeError("the event loop has ended before it answered an earlier request")
 
+    def answer(self, work: Callable[[], object]) -> None:
+        """Do work on the event loop, and call the callback when it ends, in the same turn, for all that it requests."""
+        # Until the call, no request has the loop wake. One that came before leads to another call.
+        self._requested = True
+        try:
+            work()
+        finally:
+            self._call()
+
     def _call(self) -> None:
         self._requested = False
         try:

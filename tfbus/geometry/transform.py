@@ -17,7 +17,6 @@ from typing import Any, TypedDict, Unpack, overload
 import numpy as np
 import numpy.typing as npt
 
-from tfbus import _python_kernel
 from tfbus.errors import InvalidTransformError
 from tfbus.plain import from_fields, schema_of
 from tfbus.rows import (
@@ -437,6 +436,9 @@ class Transform:
         points = np.ascontiguousarray(points, points.dtype if points.dtype.kind == "f" else np.float64)
         out = np.empty_like(points)
         if not move_points(self._row, points, out):
+            # The compiled kernel takes no such floats. Other processes need no memory for the kernel in Python.
+            from tfbus import _python_kernel
+
             _python_kernel.move_points(self._row, points, out)
         return out
 

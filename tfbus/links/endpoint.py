@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from copy import copy
-from difflib import get_close_matches
 from math import inf
 from typing import Any, Protocol
 
@@ -33,6 +32,8 @@ def check_options(options: Iterable[str], known: Any) -> None:
     """Raise `TypeError` for an option that a typed dictionary does not have, as Python does for an argument."""
     names = known.__required_keys__ | known.__optional_keys__
     for name in sorted(set(options) - names):
+        from difflib import get_close_matches
+
         near = get_close_matches(name, names)
         hint = f", did you mean {' or '.join(map(repr, near))}?" if near else f"; there are {', '.join(sorted(names))}"
         raise TypeError(f"a link has no option {name!r}{hint}")

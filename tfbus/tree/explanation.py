@@ -6,7 +6,6 @@ insertions. Formatting an `Explanation` as text needs no lock.
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from html import escape
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -133,6 +132,8 @@ class Explanation(PlainData):
         return f"<Explanation of {self.source!r} in {self.target!r}, {counted(len(self.edges), 'edge')}: {answer}>"
 
     def _repr_html_(self) -> str:
+        from html import escape
+
         return f"<pre>{escape(str(self))}</pre>"
 
     def __str__(self) -> str:

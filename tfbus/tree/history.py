@@ -20,7 +20,6 @@ from typing import Final, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
-from tfbus._python_kernel import Columns
 from tfbus.errors import (
     ExtrapolationError,
     FutureExtrapolationError,
@@ -30,7 +29,7 @@ from tfbus.errors import (
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import from_row
 from tfbus.geometry.uncertain import Belief, UncertainSample, with_belief
-from tfbus.rows import IDENTITY, Row, interpolate
+from tfbus.rows import IDENTITY, RawColumns, Row, interpolate
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest, Stamps
 from tfbus.which_kernel import History
 
@@ -169,12 +168,12 @@ class Samples:
 
     Parameters
     ----------
-    columns : Columns
+    columns : RawColumns
         The memory of the samples.
     parents, authorities : Runs or None
     """
 
-    def __init__(self, columns: Columns, parents: Runs | None, authorities: Runs | None) -> None:
+    def __init__(self, columns: RawColumns, parents: Runs | None, authorities: Runs | None) -> None:
         self._columns = columns
         self._parents = parents
         self._authorities = authorities

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from html import escape
 from typing import NamedTuple
 
 from tfbus.plain import printable
@@ -226,6 +225,9 @@ def to_html(
     str
         One ``<pre>`` element. All names are escaped, control characters too.
     """
+    # Few processes show a page, and the names of all entities take memory.
+    from html import escape
+
     drawn = [(guides, printable(frame), edge) for guides, frame, edge in branches(edges)]
     if not drawn:
         return f'<pre style="{_PRE}">(no frames)</pre>'

@@ -35,7 +35,6 @@ from operator import sub
 from typing import Any, Protocol
 from weakref import ref
 
-from tfbus._python_kernel import Place
 from tfbus.errors import (
     MAY_COME,
     AheadError,
@@ -49,7 +48,7 @@ from tfbus.errors import (
 )
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.registration import Registration
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Place
 from tfbus.statistics import BufferStatistics
 from tfbus.tree.cycles import names_below
 from tfbus.tree.forest import Forest, LoopingSample

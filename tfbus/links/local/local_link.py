@@ -71,3 +71,4 @@ class LocalLink(DomainLink):
     ) -> None:
         wire = LocalWire(domain, options.get("robot") or "", directory=directory, loopback=loopback)
         super().__init__(bus, domain, wire, **options)
+        wire.turn = self._received.answer
