@@ -1,6 +1,7 @@
 """The callbacks of a bus, the announcement of its events, and log lines that are written once for each cause."""
 
 import logging
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
@@ -60,6 +61,8 @@ class OnceLogger:
     def __init__(self, logger: logging.Logger) -> None:
         self._logger = logger
         self._seen = SeenKeys()
+        # A wire logs in a thread of its own.
+        self._lock = threading.Lock()
         # The beginning of a minute (s), and the number of lines since, by kind.
         self._written: dict[str, tuple[float, int]] = {}
 
@@ -74,7 +77,9 @@ class OnceLogger:
     def _log(
         self, level: int, key: Hashable, message: str, args: tuple[object, ...], exc_info: BaseException | None
     ) -> None:
-        if not self._seen.add(key):
+        with self._lock:
+            is_new = self._seen.add(key)
+        if not is_new:
             return
         now = time.monotonic()
         began, lines = self._written.get(message, (now, 0))

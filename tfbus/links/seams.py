@@ -90,7 +90,7 @@ class Wire(Protocol):
             has returned and later; it never blocks and never raises. The published messages of one link come in
             their order, and so do the messages that it has sent to this link.
         warn : callable
-            Takes an error of the network that the user should know; for the event loop only. It never raises.
+            Takes an error of the network that the user should know. Any thread may call it; it never raises.
 
         Raises
         ------

@@ -1,4 +1,5 @@
-from contextlib import AsyncExitStack
+from collections.abc import Iterator
+from contextlib import AsyncExitStack, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,8 @@ from support.wires import LIVE, Ear, met
 from support.zenoh_wires import listening, start_router, talk, way_to
 
 from tfbus.links.seams import Joined, Left
-from tfbus.links.zenoh import sessions, wire
-from tfbus.links.zenoh.neighbours import Neighbours
-from tfbus.links.zenoh.sessions import session_config
+from tfbus.links.zenoh import wire
+from tfbus.links.zenoh.sessions import open_session, session_config
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
 
 pytestmark = pytest.mark.anyio
@@ -94,112 +94,134 @@ async def test_an_address_in_use_is_an_os_error_and_a_router_is_entered_once(add
         pass
 
 
-@pytest.mark.parametrize("breaks", ["at first", "later"])
-async def test_a_router_whose_session_breaks_at_once_says_so_at_first_and_later_has_another_one(
-    breaks: str, address: str, domain: str, monkeypatch: pytest.MonkeyPatch
+# Told nothing
+
+
+@contextmanager
+def silent_router(address: str) -> Iterator[None]:
+    """A router with the id of one of tfbus that has no token, as one in which zenoh has panicked."""
+    with open_session(session_config(address, (), None, None), {"id": b"tfbus".hex() + "5" * 22}):
+        yield
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Begin anew soon after a router is connected without its token."""
+    monkeypatch.setattr(wire, "PATIENCE", (0.4, 0.6))
+    monkeypatch.setattr(wire, "PERIOD", 0.05)
+
+
+@pytest.mark.usefixtures("impatient")
+async def test_a_link_that_its_router_tells_nothing_says_so_and_connects_to_another_one(
+    address: str, domain: str
 ) -> None:
-    kinds: list[Any] = [Broken] if breaks == "at first" else [Silent, Broken]
-    lasting: list[zenoh.Session] = []
-
-    def neighbours(session: zenoh.Session) -> Neighbours:
-        if kinds:
-            broken: Neighbours = kinds.pop(0)(session)
-            return broken
-        lasting.append(session)
-        return Neighbours(session)
-
-    monkeypatch.setattr(wire, "Neighbours", neighbours)
-    if breaks == "at first":
-        with pytest.raises(OSError, match="the session with a router broke at once: closed"):
-            async with ZenohRouter(address):
-                raise AssertionError("it has opened")
-    async with ZenohRouter(address):
-        # zenoh panics now and then if a client connects while the session of a router closes.
-        await until(lambda: bool(lasting))
-        async with listening(domain, connect=address) as one, listening(domain, connect=address) as two:
+    silent = free_address()
+    with silent_router(silent):
+        async with (
+            ZenohRouter(address),
+            listening(domain, connect=address) as one,
+            listening(domain, connect=[silent, address]) as two,
+        ):
             await met(one, two)
             await talk(one, two)
+            (warning,) = two.warnings
+            assert f"the router at {silent} tells nothing, and the link connects again" in str(warning)
+            assert one.warnings == []
 
 
-async def test_a_link_that_its_router_tells_nothing_connects_again_and_says_so(
-    address: str, domain: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # As the session of a router does in which zenoh has panicked.
-    async with ZenohRouter(address):
-        kinds: list[Any] = [Silent]
-        monkeypatch.setattr(wire, "Neighbours", lambda session: (kinds.pop() if kinds else Neighbours)(session))
-        async with listening(domain, connect=address) as two:
-            await until(lambda: bool(two.warnings))
-            assert f"the router at {address} tells nothing, and the link connects again" in str(two.warnings[0])
-            async with listening(domain, connect=address) as one:
-                await met(one, two)
-                await talk(one, two)
-                assert len(two.warnings) == 1
-
-
+@pytest.mark.usefixtures("impatient")
 async def test_a_link_that_is_told_of_others_stays_connected_without_the_token_of_its_router(
+    address: str, domain: str
+) -> None:
+    async with (
+        ZenohRouter(address, config=denying("liveliness_token", "tfbus/@router/*")),
+        listening(domain, connect=address) as one,
+    ):
+        # The token does not come, so a link that is alone begins anew.
+        await until(lambda: bool(one.warnings))
+        async with listening(domain, connect=address) as two:
+            await met(one, two)
+            start = len(one.items), len(two.items)
+            until_then = anyio.current_time() + 1.5
+            while anyio.current_time() < until_then:
+                await talk(one, two)
+            for ear, items in zip((one, two), start, strict=True):
+                assert Left() not in [item for _, item in ear.items[items:]]
+
+
+def denying(message: str, key: str) -> dict[str, Any]:
+    """The setting of a router that passes on no such messages."""
+    rule = {"id": "rule", "messages": [message], "flows": ["egress"], "permission": "deny", "key_exprs": [key]}
+    return {
+        "access_control": {
+            "enabled": True,
+            "default_permission": "allow",
+            "rules": [rule],
+            "subjects": [{"id": "all"}],
+            "policies": [{"rules": ["rule"], "subjects": ["all"]}],
+        }
+    }
+
+
+async def test_a_router_whose_session_breaks_at_once_says_so(
     address: str, domain: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # As on a busy machine, or by access rules.
-    is_late = False
-
-    class Late(Neighbours):
-        def are_silent(self, now: float) -> bool:  # noqa: ARG002 - at any time
-            return is_late
-
-    async with ZenohRouter(address):
-        monkeypatch.setattr(wire, "Neighbours", Late)
-        monkeypatch.setattr(wire, "PERIOD", 0.01)
-        async with listening(domain, connect=address) as one, listening(domain, connect=address) as two:
-            await met(one, two)
-            is_late = True
-            for _ in range(20):
-                await talk(one, two)
-            assert not one.warnings
-            assert not two.warnings
+    monkeypatch.setattr(wire, "open_session", broken_session)
+    with pytest.raises(OSError, match="the session with a router broke at once: "):
+        async with ZenohRouter(address):
+            raise AssertionError("it has opened")
+    monkeypatch.undo()
+    async with (
+        ZenohRouter(address),
+        listening(domain, connect=address) as one,
+        listening(domain, connect=address) as two,
+    ):
+        await met(one, two)
 
 
-async def test_a_router_that_gets_no_other_session_says_so_once_and_gets_one_when_it_can(
+def broken_session(*arguments: Any) -> zenoh.Session:
+    session = open_session(*arguments)
+    session.close()
+    return session
+
+
+@pytest.mark.usefixtures("impatient")
+async def test_a_router_that_another_one_tells_nothing_has_a_new_session_and_says_once_while_it_gets_none(
     address: str, domain: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    opened: list[zenoh.Session] = []
-    in_use = True
+    silent = free_address()
+    attempts: list[str] = []
+    outcome = "in use"
 
-    def open_session(*arguments: Any) -> zenoh.Session:
-        if opened and in_use:
+    def attempt(config: zenoh.Config, own: dict[str, object]) -> zenoh.Session:
+        if config.get_json("mode") == '"client"':
+            return open_session(config, own)
+        attempts.append(outcome)
+        if outcome == "in use":
             raise OSError(f"{address} is in use")
-        opened.append(sessions.open_session(*arguments))
-        return opened[-1]
+        return broken_session(config, own) if outcome == "broken" else open_session(config, own)
 
-    kinds: list[Any] = [Silent]
-    monkeypatch.setattr(wire, "Neighbours", lambda session: (kinds.pop() if kinds else Neighbours)(session))
-    monkeypatch.setattr(wire, "open_session", open_session)
-    monkeypatch.setattr(wire, "LONGEST_CLOSE", 0.1)
-    async with ZenohRouter(address):
-        await until(lambda: bool(caplog.messages))
-        assert caplog.messages == [
-            f"this router has no session, and goes on trying; a new process would have one: {address} is in use"
-        ]
-        in_use = False
-        await until(lambda: len(opened) > 1)
-        async with listening(domain, connect=address) as one, listening(domain, connect=address) as two:
+    monkeypatch.setattr(wire, "LONGEST_CLOSE", 1.0)
+    with ExitStack() as silence:
+        silence.enter_context(silent_router(silent))
+        async with (
+            ZenohRouter(address, connect=silent),
+            listening(domain, connect=address) as one,
+            listening(domain, connect=address) as two,
+        ):
+            await met(one, two)
+            monkeypatch.setattr(wire, "open_session", attempt)
+            await until(lambda: bool(caplog.messages))
+            await until(lambda: Left() in one.of(two))
+            outcome = "broken"
+            await until(lambda: outcome in attempts)
+            silence.close()
+            outcome = "lasting"
             await met(one, two)
             await talk(one, two)
-    assert len(caplog.messages) == 1
-
-
-class Broken(Neighbours):
-    """A session that has broken before anything is declared."""
-
-    def __init__(self, session: zenoh.Session) -> None:  # noqa: ARG002 - whichever it is
-        raise zenoh.ZError("closed")
-
-
-class Silent(Neighbours):
-    """A router that is told nothing from the beginning."""
-
-    def are_silent(self, now: float) -> bool:  # noqa: ARG002 - at any time
-        return True
+            assert caplog.messages == [
+                f"this router has no session, and goes on trying; a new process would have one: {address} is in use"
+            ]
 
 
 RULES = """{
@@ -241,7 +263,7 @@ def test_a_file_of_settings_wins_over_those_of_the_router_but_for_addresses(tmp_
     assert config.get_json("transport/link/tx/lease") == "7000"
     assert config.get_json("scouting/multicast/enabled") == "false"
     for text, problem in (
-        ('{listen: {endpoints: ["tcp/0.0.0.0:1"]}}', "'listen' is not for config: give addresses by connect and"),
+        ('{listen: {endpoints: ["tcp/0.0.0.0:1"]}}', "'listen/endpoints' is not for config: give addresses by"),
         ("{no_such_setting: 1}", "zenoh does not take the settings in .*settings.json5: unknown field"),
         ("garbage", "zenoh does not take the settings in"),
     ):

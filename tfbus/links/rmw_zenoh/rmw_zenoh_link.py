@@ -160,7 +160,7 @@ class RmwZenohCarrier(RosCarrier):
         use_zenoh()
         session = self._session = zenoh.open(self._config)
         # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
-        self._close_at_exit = weakref.finalize(self, close_session, session)
+        self._close_at_exit = weakref.finalize(self, close_session, session.close)
         name = str(session.zid())
         self._token(node_token(self._domain, name, self._node))
         topics = [
@@ -240,9 +240,8 @@ class RmwZenohCarrier(RosCarrier):
         if self._close_at_exit is not None:
             self._close_at_exit.detach()
         # Closing the session undeclares all that was declared.
-        late = await wait_until_closed([begin_to_close(session)])
-        if late is not None:
-            self._report.failed(late)
+        if session is not None:
+            await wait_until_closed([begin_to_close(session.close)], self._report.failed)
         self._declared.clear()
 
     def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:

@@ -11,10 +11,10 @@ import math
 import os
 import re
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import zenoh
 
@@ -23,9 +23,7 @@ from tfbus.links.seams import MAX_MESSAGE
 from tfbus.stamps import as_duration
 
 LEASE: Final = 4.0
-"""s of silence after which the other end takes a session for lost."""
-SIGNS_OF_LIFE: Final = 4
-"""So many go out in each lease, so one may be late by three quarters of it."""
+"""s of silence after which the other end takes a session for lost; zenoh gives four signs of life in each lease."""
 OPENING_TIME: Final = 2.0
 """s; a router that has not answered by then is passed over for the next one."""
 UNSENT: Final = 8
@@ -36,23 +34,24 @@ MAX_SESSIONS: Final = 10_000
 RECEIVING_THREADS: Final = 32
 """of a router. zenoh ends a connection that is cut off by a call that waits 10 s in one of them (its issue 2718); after
 two such losses both of its usual two waited, and the router passed on nothing meanwhile."""
-LONGEST_NAME: Final = 200
 CLOSING_TIME: Final = 1.0
 LONGEST_CLOSE: Final = 15.0
 """s; so long the event loop and the interpreter wait."""
 THREAD: Final = "tfbus and zenoh end"
 """The name of each thread for whose end the interpreter waits."""
-_forked = _used = False
+_first_user: int | None = None
+"""The id of the process that has used zenoh first. A process that was forked from it has no threads of zenoh."""
 
 Addresses = str | Iterable[str]
 Settings = Mapping[str, Any] | str | os.PathLike[str]
 """Settings of zenoh by their path, or the name of a file of zenoh's settings, in JSON5."""
 
-_ON_NETWORK = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[^\]]+\]|[^:/?#\s]+):(?P<port>\d{1,5})([?#].*)?")
-_ON_MACHINE = re.compile(r"(unixsock-stream|unixpipe|serial|vsock)/.+")
+_ADDRESS = re.compile(
+    r"(tcp|udp|tls|quic|ws)/(\[[^\]]+\]|[^:/?#\s]+):(?P<port>\d{1,5})([?#].*)?"
+    r"|(unixsock-stream|unixpipe|serial|vsock)/.+"
+)
 # Each session draws its own id, and the arguments say the rest.
 _NOT_TO_SET = re.compile("id|mode|listen|listen/endpoints.*|connect|connect/endpoints.*")
-_NOT_IN_FILE = "id", "mode", "listen", "connect"
 
 
 def session_config(
@@ -86,41 +85,36 @@ def session_config(
     if not 0 < silence < math.inf:
         raise ValueError(f"lease must be a time that passes, got {lease}")
     values: dict[str, Any] = {
+        "mode": "client" if listen is None else "router",
+        "listen/endpoints": endpoints(listen or ()),
         "connect/endpoints": endpoints(connect),
+        # For routers, which go on trying; a client tries each address once.
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1_000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        # It would wait so long for routers that scouting finds.
+        "scouting/delay": 0,
         "transport/unicast/open_timeout": round(OPENING_TIME * 1_000),
+        "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/link/tx/lease": max(1, round(silence * 1_000)),
-        "transport/link/tx/keep_alive": SIGNS_OF_LIFE,
         "transport/link/tx/queue/size/data": UNSENT,
         # It would leave a file open for each link that has ended.
         "transport/shared_memory/enabled": False,
         # Larger messages are not even assembled; zenoh adds a key and some headers to each.
         "transport/link/rx/max_message_size": MAX_MESSAGE + 2**17,
     }
-    if listen is None:
-        values |= {"mode": "client", "connect/timeout_ms": 0}
-    else:
-        values |= {
-            "mode": "router",
-            "listen/endpoints": endpoints(listen),
-            "connect/timeout_ms": -1,
-            "connect/exit_on_failure": False,
-            "transport/unicast/max_sessions": MAX_SESSIONS,
-            # It would wait so long for routers that scouting finds.
-            "scouting/delay": 0,
-            "connect/retry": {"period_init_ms": 200, "period_max_ms": 1_000, "period_increase_factor": 2},
-        }
     result = zenoh.Config()
+    own: dict[str, Any] = {}
     if isinstance(config, str | os.PathLike):
         default, result = result, _read_settings(config)
-        chosen = {path for path in (*values, *_NOT_IN_FILE) if result.get_json(path) != default.get_json(path)}
-        _check_settings(chosen.intersection(_NOT_IN_FILE))
-        values = {path: value for path, value in values.items() if path not in chosen}
+        chosen = [path for path in ("id", *values) if result.get_json(path) != default.get_json(path)]
+        own = {path: json.loads(result.get_json(path)) for path in chosen}
     elif config is not None:
-        _check_settings(config)
-        values |= config
-    for path, value in values.items():
+        own = dict(config)
+    for path in own:
+        if _NOT_TO_SET.fullmatch(path):
+            raise ValueError(f"zenoh's setting {path!r} is not for config: give addresses by connect and listen")
+    for path, value in (values | own).items():
         try:
             result.insert_json5(path, json.dumps(value))
         except (zenoh.ZError, TypeError) as error:
@@ -137,12 +131,6 @@ def _read_settings(file: str | os.PathLike[str]) -> zenoh.Config:
         raise ValueError(f"zenoh does not take the settings in {file}: {without_source_location(error)}") from None
 
 
-def _check_settings(paths: Iterable[str]) -> None:
-    for path in paths:
-        if _NOT_TO_SET.fullmatch(path):
-            raise ValueError(f"zenoh's setting {path!r} is not for config: give addresses by connect and listen")
-
-
 def open_session(config: zenoh.Config, settings: Mapping[str, object] | None = None) -> zenoh.Session:
     """Open a session with some more settings; blocks.
 
@@ -150,10 +138,7 @@ def open_session(config: zenoh.Config, settings: Mapping[str, object] | None = N
     ------
     OSError
         If it cannot listen where it should, or as a client reaches nobody; with its `errno`, if there is one.
-    RuntimeError
-        If this process was forked from one that uses zenoh.
     """
-    use_zenoh()
     if config.get_json("mode") == '"router"':
         # zenoh reads it once in a process, with its first session.
         os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {RECEIVING_THREADS}))")
@@ -177,8 +162,8 @@ def endpoints(addresses: Addresses) -> list[str]:
     found = [addresses] if isinstance(addresses, str) else list(addresses)
     for address in found:
         # zenoh accepts some that it can never reach, and would try for ever.
-        on_network = _ON_NETWORK.fullmatch(address)
-        if not (int(on_network["port"]) < 2**16 if on_network else _ON_MACHINE.fullmatch(address)):
+        parts = _ADDRESS.fullmatch(address)
+        if parts is None or int(parts["port"] or 0) >= 2**16:
             raise ValueError(f"an address is like tcp/192.168.1.5:7447, not {address!r}")
     return found
 
@@ -198,51 +183,35 @@ def use_zenoh() -> None:
     RuntimeError
         If it was forked from one that did: zenoh's threads are there, and its sessions here would hear nobody.
     """
-    global _used
-    if _forked:
+    global _first_user
+    _first_user = _first_user or os.getpid()
+    if _first_user != os.getpid():
         raise RuntimeError(
             "this process was forked from one that uses zenoh, whose threads are not here: start it with the method "
             "'spawn' of multiprocessing, or fork before the first link"
         )
-    _used = True
 
 
-def _note_fork() -> None:
-    global _forked
-    _forked = _used
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_note_fork)
-
-
-class Closable(Protocol):
-    """A session of zenoh, or what belongs to one."""
-
-    def close(self) -> None: ...
-
-
-def close_session(session: Closable | None) -> None:
-    """Close a session, if there is one; a second call does nothing, and so does one in a child made by `fork`."""
-    if session is not None and not _forked:
+def close_session(close: Callable[[], object]) -> None:
+    """Call the method that closes a session; a second call does nothing, and so does one in a child made by `fork`."""
+    if _first_user == os.getpid():
         # zenoh may give up waiting for a peer; that peer notices the end by itself.
         with suppress(zenoh.ZError):
-            session.close()
+            close()
 
 
-def begin_to_close(session: Closable | None) -> threading.Thread:
-    """Close a session in a thread of its own; returns the thread."""
+def begin_to_close(close: Callable[[], object]) -> threading.Thread:
+    """Call `close_session` in a thread of its own; returns the thread."""
     # Not a thread that the interpreter waits for without a limit.
-    closing = threading.Thread(target=close_session, args=(session,), name=THREAD, daemon=True)
+    closing = threading.Thread(target=close_session, args=(close,), name=THREAD, daemon=True)
     closing.start()
     return closing
 
 
-async def wait_until_closed(closing: Sequence[threading.Thread]) -> TimeoutError | None:
-    """Wait a second for such threads, also when cancelled; returns an error if that was too short."""
-    if await wait_for_all(closing, CLOSING_TIME):
-        return None
-    return TimeoutError(f"zenoh has not closed its session within {CLOSING_TIME:g} s, and goes on in the background")
+async def wait_until_closed(closing: Sequence[threading.Thread], warn: Callable[[Exception], object]) -> None:
+    """Wait a second for such threads, also when cancelled, and warn if that was too short."""
+    if not await wait_for_all(closing, CLOSING_TIME):
+        warn(TimeoutError(f"zenoh has not closed its session within {CLOSING_TIME:g} s, and goes on in the background"))
 
 
 @atexit.register

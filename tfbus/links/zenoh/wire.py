@@ -7,10 +7,13 @@ Keys, where *robot* is ``~`` for a link without one, *link* is 32 hexadecimal di
     tfbus/domain/@to/link               messages to a link; subscribed by it alone. The attachment is the sender's
                                         id as 16 bytes
     tfbus/domain/robot/@alive/link/n    a liveliness token for each session of a link, declared when it hears all
+    tfbus/@router/zid                   a liveliness token of a router of tfbus, by the id of its session
 
 Connecting: a link dials a router, the first of its addresses that answers within `OPENING_TIME`. Links never dial each
-other. With ``listen`` a link's own session is a router; it dials the other routers, and breaks only if one of these
-tells it nothing. So does the session of a client whose router tells it nothing (see `tfbus.links.zenoh.neighbours`).
+other. With ``listen`` a link's own session is a router, and dials the other routers. A client of zenoh also connects
+again by itself, but not for the first time, not to a router that tells it nothing, and not to one that has not noticed
+the break: it keeps its id, and is refused until the lease of the old connection ends. So a link whose session has no
+router begins another one, with the next address.
 
 Present: a link is present while the token of its newest known session is seen. A new session of a present link is told
 as `Left` and `Joined`, because messages may have been lost between them. The token of an older session means nothing
@@ -18,6 +21,28 @@ any more, whenever it goes. The end of a token may overtake messages, because ze
 left when its token has gone and no message of it has come for `LAST_WORDS`. When the own session breaks, all links have
 left, and join again by the next one. A router notices by end of file that a process has died, and by silence for a
 lease that it is cut off or stopped; a link notices the same of its router, by the lease that the router announces.
+
+Told nothing: connected zenoh routers tell each other once, when a connection begins, what their clients declare:
+subscribers and tokens. Two defects of zenoh 1.10 lose that, until the connection breaks again. In both, one router is
+told too little, and keeps what it was told before: links that have gone stay present, and others are never heard.
+
+- Two routers that connect to each other have one transport of two connections. If one router takes all for lost, and
+  the other one does not yet, a new connection joins the old transport of that one, which sees no reason to tell
+  anything.
+- A transport that ends and begins anew within the 100 ms in which a router computes its routes only once is no change.
+  Nor is a router that comes in that time after another one has gone, because it gets the place of that one.
+
+So each router of tfbus has an id that shows that it is one, and a token. A router that is connected without its token
+is one of these cases, because zenoh tells tokens and subscribers by the same way. The cure is a new session with
+another id, which is a new router to all others: it is told everything. Its clients connect again, as after any break.
+
+A link is told nothing if it has connected while the session of the router closed: zenoh 1.10 panics then if it is asked
+for tokens, keeps the connection, and reads nothing from it. So a link waits for the token of its router too, unless it
+is told of other links, and the cure is the same.
+
+Nothing here heals a third defect, of routers in a ring. A token that ends within some ms of the break of a connection
+is not taken back at its other end, because the first router finds no connection any more, and those around do not pass
+it on yet. So a link that ended at this moment stays present there, until its router is not reached on any way.
 
 Bounds: a message has at most `MAX_MESSAGE` bytes; `UNSENT` buffers of 64 KiB wait for the router, what finds no room is
 dropped, and no call waits for room longer than zenoh's 50 ms, once each time that the network becomes congested;
@@ -44,15 +69,13 @@ from time import monotonic, sleep
 from typing import Any, Final
 
 import anyio
+import anyio.to_thread
 import zenoh
 
-from tfbus._aio.loops import LoopWaker
 from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
-from tfbus.links.zenoh.neighbours import PAUSE_TO_BEGIN, PAUSE_TO_LISTEN, PERIOD, Neighbours, new_id
 from tfbus.links.zenoh.sessions import (
     CLOSING_TIME,
     LONGEST_CLOSE,
-    LONGEST_NAME,
     THREAD,
     Addresses,
     Settings,
@@ -75,14 +98,22 @@ SETTLED: Final = 1.0
 """s after which a router has told a new publisher who subscribes to it."""
 LAST_WORDS: Final = 0.1
 """s without a message after which a link whose token has gone has left."""
-PAUSE: Final = (0.2, 0.6)
-"""s between two attempts to reach any router; drawn at random, because a router that starts again has many clients."""
+PAUSE: Final = 0.2, 0.6
+"""s between two attempts to have a session; drawn at random, because a router that starts again has many clients."""
+PATIENCE: Final = 2.0, 5.0
+"""s; so long a router may be connected without its token; drawn at random, so that not both begin anew at once."""
+PERIOD: Final = 1.0
+"""s between two looks at the connected routers."""
+UNTIL_KNOWN: Final = 0.01
+"""s from an event of zenoh until its session knows of it too, with some to spare."""
+PAUSE_OF_ROUTER: Final = 0.5
+"""s between two sessions of a router; a next one that comes too soon is no change for other routers."""
 NO_ROBOT: Final = "~"
 
-_NAME = re.compile(r"[\w.-]+", re.ASCII)
-_TOKEN = re.compile(
-    rf"(?P<robot>~|[\w.-]{{1,{LONGEST_NAME}}})/@alive/(?P<link>[0-9a-f]{{32}})/(?P<number>[1-9]\d{{0,8}})", re.ASCII
-)
+_TOKEN = re.compile(r"(~|[\w.-]{1,200})/@alive/([0-9a-f]{32})/([1-9]\d{0,8})", re.ASCII)
+_ROUTERS: Final = "tfbus/@router/"
+_MARK: Final = b"tfbus".hex()
+"""The ids of routers of tfbus begin so."""
 _DROP, _REMOTE = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE
 
 
@@ -127,18 +158,19 @@ class ZenohWire(Wire):
         self.id: str = os.urandom(16).hex()
         self.domain: str = f"tfbus/{domain}"
         self.own: str = f"{self.domain}/{robot or NO_ROBOT}"
-        self._addresses = deque(endpoints(connect or ()))
+        # The first one is tried, or has answered.
+        self.addresses: deque[str] = deque(endpoints(connect or ()))
         self.is_router: bool = listen is not None
-        if listen is None and not self._addresses:
+        if listen is None and not self.addresses:
             raise ValueError(
-                "a link over zenoh needs a router: connect='tcp/host:7447' is the address of one, and "
-                "listen='tcp/0.0.0.0:7447' makes this process one; the processes of one machine need none, and meet by "
-                "the local link"
+                "a link over zenoh needs a router: connect='tcp/host:7447' is one, and listen='tcp/0.0.0.0:7447' makes "
+                "this process one; the processes of one machine need none, and meet by the local link"
             )
-        self._config = session_config(listen, self._addresses, config, lease)
+        self._config = session_config(listen, self.addresses, config, lease)
         self._session: _Session | None = None
         self._sessions = 0
-        self._failure: OSError | None = None
+        self._refused: OSError | None = None
+        self._tried = threading.Event()
         # Set when the thread has something to do.
         self.changed: threading.Event = threading.Event()
         self._stopped = False
@@ -151,23 +183,23 @@ class ZenohWire(Wire):
         ------
         OSError
             If it is to listen, and cannot.
-        ValueError
-            If no robot can have a name that the link means to hear.
         RuntimeError
             If this process was forked from one that uses zenoh.
         """
-        self.hears, self.receive, self._warn = tuple(hears), receive, warn
-        self._tried = anyio.Event()
-        self._waker = LoopWaker(self._tell)
-        self._waker.bind()
+        self.hears, self.receive, self.warn = tuple(hears), receive, warn
         use_zenoh()
         # A program that exits without the end of its links has them closed all the same.
         atexit.register(self._stop)
         self._thread.start()
-        with anyio.move_on_after(math.inf if self.is_router else FIRST_WAIT):
-            await self._tried.wait()
-        if self.is_router and self._failure is not None:
-            raise self._failure
+        # With a limit of time, for a worker of asyncio keeps the interpreter.
+        longest = LONGEST_CLOSE if self.is_router else FIRST_WAIT
+        # The program may have all its worker threads busy.
+        own = anyio.CapacityLimiter(1)
+        await anyio.to_thread.run_sync(self._tried.wait, longest, abandon_on_cancel=True, limiter=own)
+        # The thread warns of all later failures.
+        self._tried.set()
+        if self._refused is not None:
+            raise self._refused
 
     async def run(self) -> None:
         """See `tfbus.links.seams.Wire`. A thread of the wire does what takes time, because zenoh's calls block."""
@@ -180,8 +212,7 @@ class ZenohWire(Wire):
 
     def publish(self, channel: str, message: bytes) -> None:
         """See `tfbus.links.seams.Wire`."""
-        session = self._session
-        if session is not None:
+        if (session := self._session) is not None:
             session.publish(channel, message)
 
     def send(self, link: str, message: bytes) -> bool:
@@ -193,193 +224,185 @@ class ZenohWire(Wire):
         """See `tfbus.links.seams.Wire`. It warns if zenoh goes on closing in the background."""
         self._stop()
         atexit.unregister(self._stop)
-        late = await wait_until_closed([] if self._thread.ident is None else [self._thread])
-        if late is not None:
-            self._warn(late)
-
-    def _tell(self) -> None:
-        """Let `open` return, and warn; on the event loop."""
-        self._tried.set()
-        # The first failure of a router is raised by `open`.
-        if not (self.is_router and self._sessions == 1) and not self._stopped and self._failure is not None:
-            failure, self._failure = self._failure, None
-            self._warn(failure)
+        if self._thread.ident is not None:
+            await wait_until_closed([self._thread], self.warn)
 
     # The thread that opens and closes sessions, because zenoh's calls block
 
     def _keep(self) -> None:
-        """Have one session after another, until the wire is closed."""
-        channels: list[str] = []
-        while (session := self._connect(channels)) is not None:
-            self._wake()
-            while not self._stopped and (pause := session.look(monotonic())) is not None:
-                self._wait(pause)
-            self._session = None
-            channels = session.channels
-            if self._stopped:
-                close_session(session)
-                return
-            session.end()
-            begin_to_close(session)
-            if self.is_router:
-                sleep(PAUSE_TO_BEGIN)
-            elif not session.broken:
-                where = self._addresses[0]
-                why = "its session may be closing, or its access rules stop tokens on tfbus/@router/*"
-                self._failure = OSError(f"the router at {where} tells nothing, and the link connects again: {why}")
-                self._wake()
-            self._addresses.rotate(-1)
-
-    def _connect(self, channels: Iterable[str]) -> "_Session | None":
-        """Try one router after the other until one answers; None if the wire is closed, or cannot listen."""
-        warns_at = monotonic() + (LONGEST_CLOSE if self.is_router else FIRST_WAIT)
+        """Have one session after another, until the wire is closed or cannot listen."""
+        patience = LONGEST_CLOSE if self.is_router else FIRST_WAIT
+        warns_at = monotonic() + patience
         while not self._stopped:
             try:
-                return self._connect_once(channels)
-            except OSError as error:
-                failure = error
-            self._addresses.rotate(-1)
-            if self.is_router and self._sessions == 1:
-                self._failure = failure
-                self._wake()
-                return None
-            if monotonic() > warns_at:
-                warns_at = math.inf
-                self._failure = self._lasting(failure)
-                self._wake()
-            # The session of a router before this one may not have freed the address yet.
-            self._wait(PAUSE_TO_LISTEN if self.is_router else uniform(*PAUSE) / len(self._addresses))
-        return None
+                session = self._connect()
+            except OSError as failure:
+                if self.is_router and not self._tried.is_set():
+                    self._refused = failure
+                    break
+                if monotonic() > warns_at:
+                    warns_at = math.inf
+                    self.warn(self._lasting(failure))
+                self._wait(uniform(*PAUSE) / max(1, len(self.addresses)))
+            else:
+                self._tried.set()
+                self._use(session)
+                warns_at = monotonic() + patience
+            self.addresses.rotate(-1)
+        self._tried.set()
+
+    def _use(self, session: "_Session") -> None:
+        """Look after a session until it breaks, or the wire is closed."""
+        while not self._stopped and (pause := session.look(monotonic())) is not None:
+            self._wait(pause)
+        self._session = None
+        if self._stopped:
+            close_session(session.close)
+        else:
+            session.end()
+            if self.is_router:
+                sleep(PAUSE_OF_ROUTER)
 
     def _lasting(self, failure: OSError) -> OSError:
         if self.is_router:
             # zenoh may never end a session in which it has panicked.
             return OSError(f"this router has no session, and goes on trying; a new process would have one: {failure}")
-        where = ", ".join(sorted(self._addresses))
+        where = ", ".join(sorted(self.addresses))
         # zenoh's usual error names the addresses once more, and no reason.
         why = "" if "Unable to connect to any of" in str(failure) else f": {failure}"
         return OSError(f"no router answers at {where}, and the link goes on trying{why}")
 
-    def _connect_once(self, channels: Iterable[str]) -> "_Session":
+    def _connect(self) -> "_Session":
         self._sessions += 1
-        own = {"id": new_id()} if self.is_router else {"connect/endpoints": [self._addresses[0]]}
-        session = _Session(self, open_session(self._config, own))
+        own = {"id": _MARK + os.urandom(11).hex()} if self.is_router else {"connect/endpoints": [self.addresses[0]]}
+        # The link may send something to another one as soon as that has joined.
+        self._session = session = _Session(self, open_session(self._config, own))
         try:
-            for channel in channels:
-                session.publisher(channel)
-            # The link may send something to another one as soon as that has joined.
-            self._session = session
             session.begin(self._sessions)
         except zenoh.ZError as error:
             self._session = None
-            session.end()
             # zenoh may not end it, if a client asks for tokens at this moment.
-            begin_to_close(session).join(CLOSING_TIME)
+            session.end().join(CLOSING_TIME)
             raise os_error(error, "the session with a router broke at once") from error
         return session
 
     def _wait(self, seconds: float) -> None:
-        self.changed.wait(seconds)
+        if self.changed.wait(seconds) and not self._stopped:
+            sleep(UNTIL_KNOWN)
         self.changed.clear()
 
     def _stop(self) -> None:
         self._stopped = True
         self.changed.set()
 
-    def _wake(self) -> None:
-        # The event loop may have ended.
-        with suppress(RuntimeError):
-            self._waker.wake()
-
 
 class _Session:
     """One session of a wire, with its declarations and publishers, and the links that are present in it.
 
-    zenoh's threads call all that takes something. zenoh's objects hold these methods, so `close` lets go of them.
+    zenoh's threads call all that takes something, until the session is closed.
     """
 
     def __init__(self, wire: ZenohWire, session: zenoh.Session) -> None:
         self._wire = wire
         self._session = session
-        self._sender = bytes.fromhex(wire.id)
         self._publishers: dict[str, tuple[zenoh.Publisher, float]] = {}
         # zenoh refuses to undeclare a publisher by which the event loop is publishing.
         self._publishing = threading.Lock()
-        self._declared: list[object] = []
-        self._neighbours: Neighbours | None = None
-        self.broken = False
+        self._tokens: list[zenoh.LivelinessToken] = []
         self._lock = threading.Lock()
         self._ended = False
         # The number of the newest session of each link that is present, and which of the wire's `hears` is for it.
         self._present: dict[str, tuple[int, int]] = {}
         # When each link that is present without a token has left.
         self._leaving: dict[str, float] = {}
+        # The routers of tfbus that have a token, and since when each connected one has none.
+        self._announced: set[str] = set()
+        self._silent: dict[str, float] = {}
+        self._patience = uniform(*PATIENCE)
 
     # For the wire
 
     def begin(self, number: int) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
-        session, wire, declared = self._session, self._wire, self._declared
-        if not wire.is_router:
-            declared.append(session.info.declare_transport_events_listener(_directly(self._take_event)))
-        self._neighbours = Neighbours(session)
+        session, wire = self._session, self._wire
+        session.info.declare_transport_events_listener(_directly(lambda _: wire.changed.set()))
+        self._watch(f"{_ROUTERS}*", self._take_router)
         if wire.is_router:
-            self._neighbours.announce()
-        declared += self._neighbours.declared
+            self._announce(f"{_ROUTERS}{session.info.zid()}")
+        self._hear(f"{wire.domain}/@to/{wire.id}", self._take_sent)
         for index, (robots, channel) in enumerate(wire.hears):
-            take = _directly(partial(self._take_published, index))
-            key = f"{wire.domain}/{robots_expression(robots)}/{channel}/*"
-            declared.append(session.declare_subscriber(key, take, allowed_origin=_REMOTE))
-        take = _directly(self._take_sent)
-        declared.append(session.declare_subscriber(f"{wire.domain}/@to/{wire.id}", take, allowed_origin=_REMOTE))
-        liveliness = session.liveliness()
-        for index, (robots, _) in enumerate(wire.hears):
-            take = _directly(partial(self._take_token, index))
-            key = f"{wire.domain}/{robots_expression(robots)}/@alive/*/*"
-            declared.append(liveliness.declare_subscriber(key, take, history=True))
-        declared.append(liveliness.declare_token(f"{wire.own}/@alive/{wire.id}/{number}"))
-        if not wire.is_router and not session.info.transports():
-            # It broke before anybody listened.
-            self.broken = True
+            links = f"{wire.domain}/{robots_expression(robots)}"
+            self._hear(f"{links}/{channel}/*", partial(self._take_published, index))
+            self._watch(f"{links}/@alive/*/*", partial(self._take_token, index))
+        self._announce(f"{wire.own}/@alive/{wire.id}/{number}")
 
     def look(self, now: float) -> float | None:
         """Tell of the links that have left by now; the s until the next look, or None to have another session."""
-        # A client that is told of other links is told all, and only waits for a token on a busy machine.
-        is_told = bool(self._present) and not self._wire.is_router
-        if self.broken or (self._neighbours is not None and not is_told and self._neighbours.are_silent(now)):
+        routers = {str(zid) for zid in self._session.info.routers_zid()}
+        is_broken = not self._wire.is_router and not routers
+        if is_broken or self._is_told_nothing(routers, now):
             return None
         with self._lock:
             for link in [link for link, due in self._leaving.items() if due <= now]:
                 self._leave(link)
             return min([PERIOD, *(due - now for due in self._leaving.values())])
 
-    def end(self) -> None:
-        """Have all links leave, and take nothing any more; in any thread."""
+    def end(self) -> threading.Thread:
+        """Have all links leave, take nothing any more, and close the session in the thread that is returned."""
         with self._lock:
             self._ended = True
             for link in list(self._present):
                 self._leave(link)
+        return begin_to_close(self.close)
 
     def close(self) -> None:
         """Close the session; blocks."""
         with self._publishing:
             for publisher, _ in list(self._publishers.values()):
-                # Otherwise zenoh keeps 13 kB of each for ever.
+                # Otherwise zenoh keeps a kB of each for ever.
                 with suppress(zenoh.ZError):
                     publisher.undeclare()
-        try:
-            self._session.close()
-        finally:
-            # The garbage collector does not see through zenoh's objects.
-            self._declared.clear()
-            self._publishers.clear()
-            self._neighbours = None
+        self._session.close()
+
+    # Declaring
+
+    def _hear(self, key: str, take: Callable[[zenoh.Sample], None]) -> None:
+        self._session.declare_subscriber(key, _directly(take), allowed_origin=_REMOTE)
+
+    def _watch(self, key: str, take: Callable[[zenoh.Sample], None]) -> None:
+        self._session.liveliness().declare_subscriber(key, _directly(take), history=True)
+
+    def _announce(self, key: str) -> None:
+        self._tokens.append(self._session.liveliness().declare_token(key))
+
+    # Routers
+
+    def _take_router(self, sample: zenoh.Sample) -> None:
+        router = str(sample.key_expr).removeprefix(_ROUTERS)
+        with self._lock:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._announced.discard(router)
+            elif router.startswith(_MARK) and len(self._announced) < MAX_LINKS:
+                self._announced.add(router)
+
+    def _is_told_nothing(self, routers: Iterable[str], now: float) -> bool:
+        """Whether one of the connected routers is of tfbus, and has had no token for too long."""
+        with self._lock:
+            silent = {router for router in routers if router.startswith(_MARK)} - self._announced
+        self._silent = {router: self._silent.get(router, now) for router in silent}
+        if not any(now - since >= self._patience for since in self._silent.values()):
+            return False
+        if self._wire.is_router:
+            return True
+        # A client that is told of other links is told all, and only waits for a token on a busy machine.
+        if self._present:
+            return False
+        where = self._wire.addresses[0]
+        why = "its session may be closing, or its access rules stop tokens on tfbus/@router/*"
+        self._wire.warn(OSError(f"the router at {where} tells nothing, and the link connects again: {why}"))
+        return True
 
     # Sending
-
-    @property
-    def channels(self) -> list[str]:
-        return list(self._publishers)
 
     def publisher(self, channel: str) -> tuple[zenoh.Publisher, float]:
         """The publisher for a channel, and since when it is there; raises `zenoh.ZError` if it is new."""
@@ -403,7 +426,7 @@ class _Session:
             self.publisher(channel)[0].put(message)
 
     def send(self, link: str, message: bytes) -> bool:
-        key, sender = f"{self._wire.domain}/@to/{link}", self._sender
+        key, sender = f"{self._wire.domain}/@to/{link}", bytes.fromhex(self._wire.id)
         with suppress(zenoh.ZError):
             self._session.put(key, message, attachment=sender, congestion_control=_DROP, allowed_destination=_REMOTE)
             return True
@@ -433,30 +456,20 @@ class _Session:
             if sample.kind == zenoh.SampleKind.PUT:
                 wire.receive("", MalformedMessageError("token", f"no link has the token {key[:100]}"))
             return
-        link, number = found["link"], int(found["number"])
-        robot = found["robot"] if found["robot"] != NO_ROBOT else ""
+        robot, link, number = found[1].replace(NO_ROBOT, ""), found[2], int(found[3])
         if link == wire.id or index != next((k for k, one in enumerate(wire.hears) if one.matches(robot)), None):
             return
         with self._lock:
-            known = self._present.get(link)
+            newest = self._present[link][0] if link in self._present else 0
             if sample.kind == zenoh.SampleKind.DELETE:
-                if known is not None and known[0] == number:
+                if number == newest:
                     self._leaving[link] = monotonic() + LAST_WORDS
                     wire.changed.set()
-                return
-            if known is None:
-                is_news = len(self._present) < MAX_LINKS
-            else:
-                is_news = number > known[0] or (number == known[0] and link in self._leaving)
-            if is_news and not self._ended:
+            elif number > newest or (number == newest and link in self._leaving):
                 self._leave(link)
-                self._present[link] = number, index
-                wire.receive(link, Joined(robot))
-
-    def _take_event(self, event: zenoh.TransportEvent) -> None:
-        if event.kind == zenoh.SampleKind.DELETE:
-            self.broken = True
-            self._wire.changed.set()
+                if len(self._present) < MAX_LINKS and not self._ended:
+                    self._present[link] = number, index
+                    wire.receive(link, Joined(robot))
 
     def _leave(self, link: str) -> None:
         if self._present.pop(link, None) is not None:
@@ -487,7 +500,6 @@ def _content(sample: zenoh.Sample) -> bytes | MalformedMessageError:
 
 def robots_expression(robots: str) -> str:
     """The key expression for the robots of a pattern, in which ``*`` stands for any letters."""
-    if not robots:
-        return NO_ROBOT
-    collapsed = re.sub(r"\*+", "*", robots)
-    return collapsed if collapsed == "*" else collapsed.replace("*", "$*")
+    if robots and not robots.strip("*"):
+        return "*"
+    return re.sub(r"\*+", "$*", robots) or NO_ROBOT
