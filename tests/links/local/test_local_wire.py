@@ -499,6 +499,7 @@ async def test_a_file_at_which_nobody_listens_is_removed(directory: str, loopbac
                 with socket.socket(socket.AF_UNIX) as dead:
                     dead.bind(str(path.with_name(name)))
         path.with_name(f"{domain}-{'0' * 23}1").write_text("no socket, no port")
+        path.with_name(f"{domain}-{'0' * 23}2").write_text(f"65536 {'00' * 32}")
         younger = LocalWire(DOMAIN, directory=directory, loopback=loopback)
         async with running(younger) as ear:
             await ear.joined(elder.id)

@@ -213,7 +213,7 @@ class LocalWire(Wire):
     def _dial(self, name: str) -> None:
         try:
             sock, key = self._place.dial(name)
-        except (ConnectionRefusedError, FileNotFoundError, BlockingIOError, ValueError):
+        except (ConnectionRefusedError, FileNotFoundError, BlockingIOError):
             # The other link has gone, or has no room for now.
             return
         except OSError as error:

@@ -154,7 +154,7 @@ class MeetingPlace:
         ------
         OSError
             If the link is not there or has no room.
-        ConnectionRefusedError, ValueError
+        ConnectionRefusedError
             If its file has no listener, or is no file of a link; then the file is removed.
         """
         path, key = self._directory / name, self.key
@@ -169,11 +169,12 @@ class MeetingPlace:
             else:
                 sock.connect(str(path))
             self._prepare(sock)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, OverflowError) as error:
             sock.close()
-            if isinstance(error, (ConnectionRefusedError, ValueError)):
-                self.remove(name)
-            raise
+            if isinstance(error, OSError) and not isinstance(error, ConnectionRefusedError):
+                raise
+            self.remove(name)
+            raise ConnectionRefusedError(f"nobody listens at {path}") from error
         return sock, key
 
     def accept(self, listener: socket.socket) -> socket.socket:
