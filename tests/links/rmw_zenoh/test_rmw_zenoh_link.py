@@ -3,6 +3,7 @@ import json
 import math
 import struct
 import sys
+import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager, contextmanager
 from functools import partial
@@ -380,10 +381,15 @@ async def test_a_session_that_does_not_close_in_time_is_told(
         async with joined(address):
             pass
         assert caplog.records == [], "an end in time is no failure"
+        told, begin = threading.Event(), sessions.begin_to_close
+        monkeypatch.setattr(
+            rmw_zenoh_link, "begin_to_close", lambda close: begin(lambda: told.wait(SECONDS) and close())
+        )
         monkeypatch.setattr(sessions, "CLOSING_TIME", 0.0)
         async with joined(address):
             pass
         assert "zenoh has not closed its session" in caplog.text
+        told.set()
 
 
 @pytest.mark.parametrize("cases", [300, pytest.param(3_000, marks=pytest.mark.thorough)])
