@@ -10,15 +10,15 @@ Each side of a connection sends frames: a length (u32, little-endian) and as man
 ======  ======================  ============================================================================
 frame   what it is              its bytes
 ======  ======================  ============================================================================
-first   hello                   ``tfbus local 3\\n``, id (32), half of the key (16), robot; then for each `Hearing`
-                                of its sender, in their order: ``\\n``, the pattern, a space, the channel
+first   hello                   ``tfbus local 2\\n``, id (32), half of the key (16), robot
+second  welcome                 the channel that its sender hears of the other; empty for none
 others  messages                what `publish` and `send` were given
 ======  ======================  ============================================================================
 
-The side that has connected says hello first, and the other side answers with its own. A connection is *met* for a side
-that has read the other's hello, and nothing goes before a hello, so no message can come too early. For Unix sockets
-the key is zeros, and the kernel tells the user of the other process. On the loopback the key stands in the file that
-names the port; the side that has connected says the first half, and the side that listens
+The side that has connected says hello first. The other side answers with hello and welcome, and the first side with
+its welcome. A connection is *met* for a side when it has both, so nothing that is sent after `Joined` can come too
+early. For Unix sockets the key is zeros, and the kernel tells the user of the other process. On the loopback the key
+stands in the file that names the port; the side that has connected says the first half, and the side that listens
 answers with the second. So a program that listens at the port of a link that has gone learns only a half that nobody
 asks for any more, and cannot answer.
 
@@ -108,7 +108,9 @@ class LocalWire(Wire):
     ) -> None:
         self.id: str = secrets.token_hex(16)
         self._robot = robot
-        self._place = MeetingPlace(domain, self.id, directory, loopback)
+        self._place = MeetingPlace(
+            domain, self.id, directory, not hasattr(socket, "AF_UNIX") if loopback is None else loopback
+        )
         self._listener: socket.socket | None = None
         # All connections, the oldest first; and the met ones, by the ids of the other links.
         self._connections: dict[Connection, None] = {}
@@ -121,6 +123,7 @@ class LocalWire(Wire):
         self._hears, self._receive, self._warn = tuple(hears), receive, warn
         self._poll = Poll()
         _open_wires.add(self)
+        self._listen()
         self._look()
         await anyio.lowlevel.checkpoint()
 
@@ -157,11 +160,10 @@ class LocalWire(Wire):
                     for connection in self._links.values():
                         tasks.start_soon(connection.drain)
         finally:
-            self._close_all()
+            self._close_sockets()
+            self._poll.close()
 
-    def _close_all(self) -> None:
-        # The poll object first: a child process shares it with its parent, for which it has to stay as it is.
-        self._poll.close()
+    def _close_sockets(self) -> None:
         self._stop_listening()
         for connection in self._connections:
             connection.close()
@@ -169,6 +171,13 @@ class LocalWire(Wire):
         self._links.clear()
 
     # Listening and dialling
+
+    def _listen(self) -> None:
+        """Show the link's name, also when it has vanished."""
+        listener = self._place.open()
+        self._stop_listening()
+        self._listener = listener
+        self._poll.watch(listener, None, EVENT_READ)
 
     def _stop_listening(self) -> None:
         if self._listener is not None:
@@ -181,27 +190,29 @@ class LocalWire(Wire):
         while True:
             await anyio.sleep(pause * uniform(0.8, 1.2))
             pause = min(3 * pause, _RARELY)
+            if self._listener is not None:
+                # There may be free files again.
+                self._poll.watch(self._listener, None, EVENT_READ)
             begun = monotonic() - PATIENCE
-            for connection in [each for each in self._connections if not each.link and each.begun < begun]:
+            for connection in [each for each in self._connections if not each.met and each.begun < begun]:
                 self._end(connection)
-            try:
-                # A younger link connects by itself, unless it was killed.
-                self._look(younger=pause == _RARELY)
-            except OSError as error:
-                self._warn(error)
+            # A younger link connects by itself, unless it was killed.
+            self._look(younger=pause == _RARELY)
 
     def _look(self, younger: bool = False) -> None:
-        """Connect to the older links that are not met, or to all, and show this link's name unless it is there."""
-        if self._listener is None or self._place.name not in self._place.names():
-            listener = self._place.open()
-            self._stop_listening()
-            self._listener = listener
-        # Again, because there may be free files after there were none.
-        self._poll.watch(self._listener, self._listener, EVENT_READ)
-        # A name ends with the beginning of the id.
-        known = {self.id[:8], *(each.dialled[-8:] or each.link[:8] for each in self._connections)}
-        for name in self._place.names():
-            if name[-8:] not in known and (younger or name < self._place.name) and not self._is_full():
+        """Connect to the older links that are not met, or to all, and show this link's name if it has vanished."""
+        try:
+            names = self._place.names()
+            if self._place.name not in names:
+                self._listen()
+        except OSError as error:
+            self._warn(error)
+            return
+        dialled = {connection.dialled for connection in self._connections}
+        met = {link[:8] for link in self._links}
+        for name in names:
+            is_wanted = name < self._place.name or (younger and name != self._place.name)
+            if is_wanted and name not in dialled and name[-8:] not in met and not self._is_full():
                 self._dial(name)
 
     def _is_full(self) -> bool:
@@ -222,26 +233,35 @@ class LocalWire(Wire):
         connection = Connection(sock, self._poll, key, name, waits=self._place.loopback)
         self._connections[connection] = None
         if name < self._place.name:
-            connection.say_hello(self.id, self._robot, self._hears)
+            connection.say_hello(self.id, self._robot)
 
-    def _accept(self, listener: socket.socket) -> None:
+    def _accept(self) -> None:
+        assert self._listener is not None
         try:
-            sock = self._place.accept(listener)
+            sock, _ = self._listener.accept()
         except (BlockingIOError, ConnectionAbortedError):
             return
         except OSError as error:
+            # There are too many open files. Existing connections go on, and the next look tries again.
             self._warn(error)
-            if not isinstance(error, PermissionError):
-                # There are too many open files. Existing connections go on, and the next look tries again.
-                self._poll.watch(listener, listener, 0)
+            self._poll.watch(self._listener, None, 0)
             return
-        strangers = [each for each in self._connections if not each.link and not each.dialled]
+        try:
+            self._place.prepare(sock)
+        except OSError as error:
+            sock.close()
+            self._warn(error)
+            return
+        strangers = [each for each in self._connections if not each.met and not each.dialled]
         if len(strangers) >= MOST_STRANGERS:
             self._end(strangers[0])
         if self._is_full():
             sock.close()
             return
-        self._connections[Connection(sock, self._poll, self._place.key)] = None
+        connection = Connection(sock, self._poll, self._place.key)
+        self._connections[connection] = None
+        # Mostly the hello is there already, so links that connect all at once do not push each other out.
+        self._read(connection)
 
     # Moving bytes
 
@@ -252,21 +272,27 @@ class LocalWire(Wire):
         self._ready = self._ready or deque(self._poll.ready())
         while self._ready and not self._budget.spent:
             key, events = self._ready.popleft()
-            if isinstance(key.data, socket.socket):
-                self._accept(key.data)
+            connection = key.data
+            if connection is None:
+                self._accept()
+                continue
             # The reading first: it tells the error of a socket, and ends its connection.
-            if events & EVENT_READ and key.data in self._connections:
-                self._read(key.data)
-            if events & EVENT_WRITE and key.data in self._connections:
-                key.data.flush()
+            if events & EVENT_READ and not connection.closed:
+                self._read(connection)
+            if events & EVENT_WRITE and not connection.closed:
+                connection.flush()
 
     def _read(self, connection: Connection) -> None:
         try:
             for content in connection.read():
-                if connection.link:
+                if connection.met:
                     self._receive(connection.link, content)
                 else:
                     self._greet(connection, content)
+                if connection.closed:
+                    return
+        except BlockingIOError:
+            return
         except OSError as error:
             if isinstance(error, ConnectionRefusedError):
                 # Only a socket of the loopback says so late.
@@ -281,7 +307,7 @@ class LocalWire(Wire):
                 self._refuse(idle, MalformedMessageError("oversized", "unfinished messages of all links are too large"))
 
     def _refuse(self, connection: Connection, error: ValueError) -> None:
-        if connection.link and isinstance(error, MalformedMessageError):
+        if connection.met and isinstance(error, MalformedMessageError):
             self._receive(connection.link, error)
         else:
             self._warn(error)
@@ -293,40 +319,40 @@ class LocalWire(Wire):
         del self._connections[connection]
         if self._links.get(connection.link) is connection:
             del self._links[connection.link]
-            if connection.heard:
+            if connection.heard is not None:
                 self._receive(connection.link, Left())
 
     def _greet(self, connection: Connection, content: bytes) -> None:
-        """Take a hello, and answer it unless this side has connected.
-
-        Raises
-        ------
-        ValueError
-            If it is no hello, or does not know the key.
-        ConnectionAbortedError
-            If its link is connected already.
-        """
-        connection.take_hello(content, self._robot, self._hears)
+        """Take a hello or a welcome; raises `ValueError` if it is none."""
+        if connection.link:
+            connection.take_welcome(content)
+        else:
+            connection.take_hello(content)
         if connection.link == self.id or connection.link in self._links:
-            raise ConnectionAbortedError(f"the link {connection.link} is connected already")
-        if not connection.dialled:
-            connection.say_hello(self.id, self._robot, self._hears)
-        self._links[connection.link] = connection
-        if connection.heard:
-            self._receive(connection.link, Joined(connection.robot))
+            self._end(connection)
+        elif connection.met:
+            self._links[connection.link] = connection
+            if connection.heard is not None:
+                self._receive(connection.link, Joined(connection.robot))
+        else:
+            if not connection.dialled:
+                connection.say_hello(self.id, self._robot)
+            connection.say_welcome(next((one.channel for one in self._hears if one.matches(connection.robot)), None))
 
     def abandon(self) -> None:
         """Forget everything in a child process, where it belongs to the parent."""
         self._place.name = ""
-        self._close_all()
+        self._poll.close()
+        self._close_sockets()
 
 
 _open_wires: WeakSet[LocalWire] = WeakSet()
 
 
 def _abandon_all() -> None:
-    while _open_wires:
-        _open_wires.pop().abandon()
+    for wire in _open_wires:
+        wire.abandon()
+    _open_wires.clear()
 
 
 if hasattr(os, "register_at_fork"):
