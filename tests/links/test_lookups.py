@@ -407,6 +407,20 @@ async def test_whatever_a_server_answers_a_lookup_has_its_answer_or_a_remote_loo
             assert again.answer == FOUND
 
 
+async def test_an_answer_without_the_covariance_that_was_asked_for_is_a_remote_lookup_error() -> None:
+    network = MemoryNetwork()
+    with Bus() as bus:
+        async with DomainLink(bus, "tf", network.wire()) as asker, anyio.create_task_group() as tasks:
+            stranger = Stranger(network)
+            await stranger.open()
+            waiting = Asked(tasks, lambda: asker.lookup("map", "base", 7, robot="r1", covariance=True))
+            await until(lambda: bool(stranger.bodies))
+            stranger.say(asker.id, Kind.LOOKUP_ANSWER, stranger.bodies[0][1][:8] + write_answer(FOUND))
+            await until(lambda: waiting.ended)
+            assert isinstance(waiting.error, RemoteLookupError)
+            assert "not an answer: it has no covariance" in str(waiting.error)
+
+
 async def test_what_is_no_question_is_refused_and_counted_and_harms_nobody() -> None:
     async with asked() as scene:
         scene.bus.publish(static("map", "base"))

@@ -330,6 +330,10 @@ def _write_belief(sample: TransformStamped) -> bytes:
 # Reading
 
 
+_Told = tuple[ReceivedBatch | RemovedFrame, int]
+"""An entry whose samples are not there yet, and their number."""
+
+
 def kind_of(data: bytes) -> Kind | None:
     """The kind of a message; None if it is of no known kind or version."""
     return _KINDS.get(data[1]) if len(data) >= 2 and data[0] == VERSION else None
@@ -361,7 +365,7 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
     if len(data) > MAX_BYTES:
         raise MalformedMessageError("oversized", f"{len(data)} bytes, more than {MAX_BYTES}")
     try:
-        heard, end, counts, tags, beliefs = yield from _read_head(kind, data)
+        heard, end, told, tags, beliefs = yield from _read_head(kind, data)
     except (struct.error, IndexError):
         detail = f"the head of a message of {len(data)} bytes is cut off or inconsistent"
         raise MalformedMessageError("head", detail) from None
@@ -383,8 +387,7 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
         sample = samples[place]
         samples[place] = None if sample is None else _with_belief(sample, belief)
     place = size = 0
-    entries, heard.entries = heard.entries, []
-    for entry, count in zip(entries, counts, strict=True):
+    for entry, count in told:
         if size >= _PART:
             heard.goes_on = True
             yield heard
@@ -413,11 +416,12 @@ def read_fields(data: bytes) -> dict[str, Any]:
 
 def _read_head(
     kind: Kind, data: bytes
-) -> Generator[None, None, tuple[Heard, int, list[int], list[tuple[str, bool]], dict[int, Belief]]]:
+) -> Generator[None, None, tuple[Heard, int, list[_Told], list[tuple[str, bool]], dict[int, Belief]]]:
     """The part of a message before its samples.
 
-    It ends with the message, whose entries have no samples yet; the place of the samples; the number of samples of each
-    entry; the authority of each sample, and whether it is static; and the covariances, by the places of their samples.
+    It ends with the message, which has no entries yet; the place of the samples; the entries, each with the number of
+    its samples; the authority of each sample, and whether it is static; and the covariances, by the places of their
+    samples.
     """
     _, _, flags, ways, origin_count, authority_count, entry_count, number, bus, *claimed = _HEADER.unpack_from(data)
     if entry_count > MAX_ENTRIES:
@@ -448,8 +452,7 @@ def _read_head(
         authority = intern(data[at : at + length].decode())
         named += (authority, False), (authority, True)
         at += length
-    entries: list[ReceivedBatch | RemovedFrame] = []
-    counts: list[int] = []
+    told: list[_Told] = []
     tags: list[tuple[str, bool]] = []
     beliefs: dict[int, Belief] = {}
     # Each entry takes some bytes, so a false count ends the loop with an error before the list grows long.
@@ -459,8 +462,7 @@ def _read_head(
         entry_kind, origin, size, entry_number = _ENTRY.unpack_from(data, at)
         at += _ENTRY.size
         if entry_kind == _REMOVAL and size <= MAX_NAME:
-            entries.append(RemovedFrame(origins[origin][0], entry_number, data[at : at + size].decode()))
-            counts.append(0)
+            told.append((RemovedFrame(origins[origin][0], entry_number, data[at : at + size].decode()), 0))
             at += size
         elif entry_kind in (_BATCH, _UNCERTAIN):
             first = len(tags)
@@ -475,16 +477,16 @@ def _read_head(
                 if len(beliefs) % _BELIEFS_AT_ONCE == _BELIEFS_AT_ONCE - 1:
                     yield None
             named_origin, clock = origins[origin]
-            entries.append(ReceivedBatch(named_origin, entry_number, [], None if clock == _NO_CLOCK else clock))
-            counts.append(size)
+            batch = ReceivedBatch(named_origin, entry_number, [], None if clock == _NO_CLOCK else clock)
+            told.append((batch, size))
         else:
             raise IndexError
     # Slicing past the end raises nothing, so the end is checked.
     if at > len(data) or at > MAX_HEAD:
         raise IndexError
     claim = Claim(since, sequence, digest, bool(flags & _FINAL), bool(flags & _PARTIAL))
-    heard = Heard(kind, bus, number, claim, time, reach, bool(flags & _SERVES), entries=entries)
-    return heard, at, counts, tags, beliefs
+    heard = Heard(kind, bus, number, claim, time, reach, bool(flags & _SERVES))
+    return heard, at, told, tags, beliefs
 
 
 def _read_belief(data: bytes, at: int) -> tuple[Belief | None, int]:

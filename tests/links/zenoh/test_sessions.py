@@ -107,7 +107,7 @@ def test_each_end_announces_its_lease_and_says_more_often_that_it_lives() -> Non
         (session_config("tcp/127.0.0.1:0", (), None, 1.5), 1.5),
     ):
         assert read(config, "transport/link/tx/lease") == lease * 1_000
-        assert read(config, "transport/link/tx/keep_alive") >= 3
+        assert read(config, "transport/link/tx/keep_alive") == 4
 
 
 def test_a_router_takes_as_many_sessions_as_a_link_hears_others() -> None:
