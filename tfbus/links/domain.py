@@ -354,7 +354,7 @@ class DomainEnd(Endpoint):
                     return
             if heard.kind is not Kind.SIGN:
                 self.messages += 1
-        if heard.kind is Kind.LIVE and self._history.holds(sender, heard):
+        if heard.kind is Kind.LIVE and sender in self._history.open and self._history.holds(sender, heard):
             return
         self._take_held(peer, heard)
 

@@ -116,12 +116,9 @@ class HistoryAsker:
             self._ask(peer, "")
 
     def holds(self, peer: str, message: Heard) -> bool:
-        """Hold a live message back; returns whether that is so."""
-        waiting = self.open.get(peer)
-        if waiting is None or len(waiting.held) >= MOST_HELD:
-            return False
-        size = _size(message)
-        if self._size + size > MOST_HELD_SAMPLES:
+        """Hold a live message of an asked peer back; returns whether there is room."""
+        waiting, size = self.open[peer], _size(message)
+        if len(waiting.held) >= MOST_HELD or self._size + size > MOST_HELD_SAMPLES:
             return False
         waiting.held.append(message)
         self._size += size
