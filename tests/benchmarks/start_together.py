@@ -34,11 +34,15 @@ class Facts(NamedTuple):
     linked: float
     """The same from the moment when the last process, with all its imports, began its link."""
     delay: float
-    """The median of the seconds from the stamp of a sample until it was here, once all were there."""
+    """The median of the seconds from the stamp of a sample until it was here, later; infinite if it has ended."""
 
 
 async def live(number: int, processes: int, link: dict[str, Any], seconds: float) -> None:
-    """Be one of the processes; print when all static frames were there, and the delay of samples `seconds` after it."""
+    """Be one of the processes; print when all static frames were there, and then the delay of samples again and again.
+
+    The first line has the time of the link's beginning, and that at which all static frames were there; each other line
+    the beginning of a period of some `seconds`, and the median delay in it.
+    """
     wanted = processes * FRAMES
     held: set[str] = set()
     delays: list[float] = []
@@ -50,7 +54,7 @@ async def live(number: int, processes: int, link: dict[str, Any], seconds: float
         if len(held) < wanted:
             held.update(sample.child for sample in batch if sample.static)
             met = time.monotonic() if len(held) == wanted else met
-        elif not batch[0].static and batch[0].authority != f"p{number}" and met + seconds / 2 < time.monotonic():
+        elif not batch[0].static and batch[0].authority != f"p{number}":
             delays.append((now - batch[0].stamp) / SECOND)
 
     with Bus() as bus:
@@ -61,16 +65,22 @@ async def live(number: int, processes: int, link: dict[str, Any], seconds: float
         began = time.monotonic()
         async with link_of(bus, link):
             await bus.clock.sleep(number / processes / RATE)
-            told = False
+            period = math.inf
             async for _ in bus.clock.ticks(RATE):
                 broadcaster.send_all([("map", f"moving {number} {frame}", Transform()) for frame in range(FRAMES)])
-                if not told and met + seconds < time.monotonic():
-                    told = True
-                    print(json.dumps([began, met, median(delays or [math.inf])]), flush=True)
+                now = time.monotonic()
+                if period == math.inf and met < now:
+                    print(json.dumps([began, met]), flush=True)
+                elif now < period + seconds:
+                    continue
+                else:
+                    print(json.dumps([period, median(delays or [math.inf])]), flush=True)
+                delays.clear()
+                period = now
 
 
-def measure(processes: int, place: Place, seconds: float = 0.0) -> list[Facts]:
-    """Start them; measure the delay for some `seconds` after a process has met all."""
+def measure(processes: int, place: Place, seconds: float = 0.0, *, stay: int | None = None) -> list[Facts]:
+    """Start them; when each has all static frames, end all but so many, and measure the delay for some `seconds`."""
     started: list[subprocess.Popen[str]] = []
 
     def end_all() -> None:
@@ -93,15 +103,35 @@ def measure(processes: int, place: Place, seconds: float = 0.0) -> list[Facts]:
             last = time.monotonic()
             patience = Timer(PATIENCE, end_all)
             patience.start()
-            ends = [process.stdout.readline() for process in started if process.stdout is not None]
+            firsts = [_read(process) for process in started]
             patience.cancel()
+            for process in started[stay:] if stay else ():
+                process.kill()
+            calm = time.monotonic() + seconds / 2
+            delays = [_delay_after(process, calm) if seconds else math.inf for process in started[:stay]]
         finally:
             end_all()
             for process in started:
                 process.communicate()
-    found = [json.loads(end) if end else (0.0, math.inf, math.inf) for end in ends]
-    linked = max(began for began, _, _ in found)
-    return [Facts(met - last, met - linked, delay) for _, met, delay in found]
+    found = [first or (0.0, math.inf) for first in firsts]
+    linked = max(began for began, _ in found)
+    delays += [math.inf] * (processes - len(delays))
+    return [Facts(met - last, met - linked, delay) for (_, met), delay in zip(found, delays, strict=True)]
+
+
+def _read(process: "subprocess.Popen[str]") -> tuple[float, float] | None:
+    """The next line that a process prints; None if it has ended."""
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    return json.loads(line) if line else None
+
+
+def _delay_after(process: "subprocess.Popen[str]", time: float) -> float:
+    """The delay in the first period of a process that begins after a time."""
+    while (period := _read(process)) is not None:
+        if period[0] >= time:
+            return period[1]
+    return math.inf
 
 
 if __name__ == "__main__":

@@ -291,12 +291,15 @@ def test_peers(table: Table, place: Place) -> None:
     table.add("a message to 50 peers", f"{(end - rested) / MESSAGES * 1e6:.0f} us CPU", wanted="<= 500 us")
 
 
-@pytest.mark.parametrize(("count", "wanted"), [(5, "<= 0.2 s"), (30, "p50 <= 150 ms"), (50, "<= 12 s, no backlog")])
-def test_start(table: Table, place: Place, count: int, wanted: str) -> None:
-    found = measure(count, place, 5.0)
+@pytest.mark.parametrize(
+    ("count", "stay", "wanted"), [(5, 5, "<= 0.2 s"), (30, 30, "p50 <= 150 ms"), (50, 20, "<= 12 s, no backlog")]
+)
+def test_start(table: Table, place: Place, count: int, stay: int, wanted: str) -> None:
+    """The delay is that among so many processes, when the others have ended."""
+    found = measure(count, place, 5.0, stay=stay)
     met, linked = max(facts.met for facts in found), max(facts.linked for facts in found)
-    delays = sorted(facts.delay * 1e3 for facts in found)
-    spread = f"then p50 {median(delays):.1f} ms, {delays[-1]:.1f} at worst"
+    delays = sorted(facts.delay * 1e3 for facts in found[:stay])
+    spread = f"then p50 {median(delays):.1f} ms, {delays[-1]:.1f} at worst of {stay}"
     label = f"{count} processes start, their links; all have all"
     table.add(label, f"{met:.2f}; {linked:.2f} s", spread, "", wanted)
 
