@@ -2,11 +2,10 @@
 
 import os
 from collections.abc import Callable, Sequence
-from fnmatch import fnmatchcase
 
 import anyio
 
-from tfbus.links.seams import Hearing, Joined, Left, Receive
+from tfbus.links.seams import Hearing, Joined, Left, Receive, first_match
 
 
 class MemoryNetwork:
@@ -89,7 +88,8 @@ class MemoryWire:
             self._network.kill(self.id)
 
     def channel_of(self, robot: str) -> str | None:
-        return next((hearing.channel for hearing in self._hears if fnmatchcase(robot, hearing.robots)), None)
+        hearing = first_match(self._hears, robot)
+        return hearing and hearing.channel
 
     def meet(self, other: "MemoryWire") -> None:
         is_new = self.channel_of(other.robot) is not None and other.id not in self.met

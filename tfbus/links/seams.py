@@ -6,7 +6,7 @@ one class. `tfbus.links.ros.foreign_end` has the seam below a link to another wo
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Final, NamedTuple, Protocol
@@ -38,6 +38,11 @@ class Hearing(NamedTuple):
     def matches(self, robot: str) -> bool:
         """Whether a robot has a name of the pattern; in linear time, for strangers choose the names."""
         return fnmatchcase(robot, self.robots)
+
+
+def first_match(hears: Iterable[Hearing], robot: str) -> Hearing | None:
+    """The first that matches a robot, and so is for its links; None if the robot is not heard."""
+    return next((hearing for hearing in hears if hearing.matches(robot)), None)
 
 
 @dataclass(frozen=True, slots=True)

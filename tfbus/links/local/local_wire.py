@@ -63,7 +63,7 @@ import anyio.lowlevel
 from tfbus._aio.turn_budget import TurnBudget
 from tfbus.links.local.connection import Connection, Poll, frame_of
 from tfbus.links.local.meeting_place import MeetingPlace
-from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire, first_match
 from tfbus.tf_message import MalformedMessageError
 
 MOST_CONNECTIONS: Final = 1_000
@@ -337,7 +337,8 @@ class LocalWire(Wire):
         else:
             if not connection.dialled:
                 connection.say_hello(self.id, self._robot)
-            connection.say_welcome(next((one.channel for one in self._hears if one.matches(connection.robot)), None))
+            hearing = first_match(self._hears, connection.robot)
+            connection.say_welcome(hearing and hearing.channel)
 
     def abandon(self) -> None:
         """Forget everything in a child process, where it belongs to the parent."""
