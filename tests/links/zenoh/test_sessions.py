@@ -21,7 +21,6 @@ from tfbus.links.zenoh.sessions import (
     open_session,
     session_config,
 )
-from tfbus.links.zenoh.wire import MAX_LINKS
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
 
 ROUTER = "tcp/127.0.0.1:7447"
@@ -108,10 +107,6 @@ def test_each_end_announces_its_lease_and_says_more_often_that_it_lives() -> Non
     ):
         assert read(config, "transport/link/tx/lease") == lease * 1_000
         assert read(config, "transport/link/tx/keep_alive") == 4
-
-
-def test_a_router_takes_as_many_sessions_as_a_link_hears_others() -> None:
-    assert read(session_config("tcp/127.0.0.1:0", (), None, None), "transport/unicast/max_sessions") >= MAX_LINKS
 
 
 def test_settings_of_zenoh_win_over_those_of_the_link() -> None:

@@ -1,4 +1,5 @@
 import gc
+import json
 import signal
 import sys
 import threading
@@ -16,6 +17,7 @@ from support.wires import LIVE, Ear, met
 from support.zenoh_wires import listening, start_router, talk
 
 from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left
+from tfbus.links.zenoh import wire
 from tfbus.links.zenoh.sessions import open_session, session_config
 from tfbus.links.zenoh.wire import ZenohWire
 from tfbus.links.zenoh.zenoh_router import ZenohRouter
@@ -204,6 +206,28 @@ async def test_a_link_without_a_router_opens_warns_once_and_connects_when_there_
     assert two.warnings == []
 
 
+async def test_a_program_that_is_no_router_is_warned_of_once_and_dialled_with_pauses(
+    address: str, domain: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attempts: list[object] = []
+
+    def attempt(*arguments: Any) -> zenoh.Session:
+        attempts.append(arguments)
+        return open_session(*arguments)
+
+    monkeypatch.setattr(wire, "open_session", attempt)
+    peer = zenoh.Config()
+    for path, value in (("mode", "peer"), ("listen/endpoints", [address]), ("scouting/multicast/enabled", False)):
+        peer.insert_json5(path, json.dumps(value))
+    with open_session(peer):
+        async with listening(domain, connect=address) as one:
+            await anyio.sleep(3.0)
+            (warning,) = one.warnings
+            assert f"no router answers at {address}" in str(warning)
+            assert "is no router" in str(warning)
+            assert 2 <= len(attempts) <= 15
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("who", ["the router", "a link", "the router that is also a link"])
 async def test_silence_for_longer_than_the_lease_is_healed(who: str, address: str, domain: str) -> None:
@@ -284,7 +308,8 @@ async def test_a_router_that_is_stopped_holds_nobody_up(address: str, domain: st
 
 
 async def test_a_link_needs_the_address_of_a_router(domain: str) -> None:
-    given: list[dict[str, Any]] = [{}, {"connect": None}, {"connect": []}, {"connect": ""}]
+    given: list[dict[str, Any]] = [{}, {"connect": None}, {"connect": []}, {"connect": ""}, {"listen": []}]
+    given += [{"listen": "", "connect": "tcp/127.0.0.1:7447"}]
     for options in given:
         with pytest.raises(ValueError, match=r"connect='tcp/host:7447'.* the local link"):
             ZenohWire(domain, **options)
@@ -314,12 +339,12 @@ async def test_an_opening_that_is_cancelled_at_any_moment_leaves_nothing(address
         await until(lambda: not other.present)
         with leaving_nothing():
             for tenths in range(60):
-                wire = ZenohWire(domain, connect=address)
+                cancelled = ZenohWire(domain, connect=address)
                 with anyio.move_on_after(tenths / 10_000) as scope:
-                    await wire.open([Hearing("*", LIVE)], lambda link, item: None, lambda error: None)  # noqa: ARG005
+                    await cancelled.open([Hearing("*", LIVE)], lambda link, item: None, lambda error: None)  # noqa: ARG005
                     await anyio.sleep_forever()
                 assert scope.cancelled_caught
-                await wire.close()
+                await cancelled.close()
             await until(lambda: not other.present)
 
 

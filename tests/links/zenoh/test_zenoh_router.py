@@ -163,11 +163,30 @@ def denying(message: str, key: str) -> dict[str, Any]:
     }
 
 
+class Panic(BaseException):
+    """As the exception by which a panic of zenoh comes to Python."""
+
+
+class PanickingSession:
+    """A session that panics when it is asked to declare something."""
+
+    def __init__(self, *arguments: Any) -> None:
+        self._session = open_session(*arguments)
+
+    @property
+    def info(self) -> Any:
+        raise Panic("poisoned")
+
+    def close(self) -> None:
+        self._session.close()
+
+
+@pytest.mark.parametrize("failing", ["broken", "panicking"])
 async def test_a_router_whose_session_breaks_at_once_says_so(
-    address: str, domain: str, monkeypatch: pytest.MonkeyPatch
+    failing: str, address: str, domain: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(wire, "open_session", broken_session)
-    with pytest.raises(OSError, match="the session with a router broke at once: "):
+    monkeypatch.setattr(wire, "open_session", broken_session if failing == "broken" else PanickingSession)
+    with pytest.raises(OSError, match="the new session broke at once: "):
         async with ZenohRouter(address):
             raise AssertionError("it has opened")
     monkeypatch.undo()

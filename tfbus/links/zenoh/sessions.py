@@ -29,8 +29,9 @@ OPENING_TIME: Final = 2.0
 UNSENT: Final = 8
 """So many buffers of 64 KiB may wait for the router before messages are dropped; zenoh's two are full whenever its
 thread waits for a CPU for some ms."""
-MAX_SESSIONS: Final = 10_000
-"""A router takes so many; zenoh's own thousand would be full without a word."""
+MAX_LINKS: Final = 10_000
+"""A router takes so many sessions, and a link hears so many others; zenoh's own thousand sessions would be full without
+a word."""
 RECEIVING_THREADS: Final = 32
 """of a router. zenoh ends a connection that is cut off by a call that waits 10 s in one of them (its issue 2718); after
 two such losses both of its usual two waited, and the router passed on nothing meanwhile."""
@@ -95,7 +96,7 @@ def session_config(
         # It would wait so long for routers that scouting finds.
         "scouting/delay": 0,
         "transport/unicast/open_timeout": round(OPENING_TIME * 1_000),
-        "transport/unicast/max_sessions": MAX_SESSIONS,
+        "transport/unicast/max_sessions": MAX_LINKS,
         "transport/link/tx/lease": max(1, round(silence * 1_000)),
         "transport/link/tx/queue/size/data": UNSENT,
         # It would leave a file open for each link that has ended.

@@ -65,17 +65,18 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from random import uniform
-from time import monotonic, sleep
+from time import monotonic
 from typing import Any, Final
 
 import anyio
 import anyio.to_thread
 import zenoh
 
-from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire, first_match
 from tfbus.links.zenoh.sessions import (
     CLOSING_TIME,
     LONGEST_CLOSE,
+    MAX_LINKS,
     THREAD,
     Addresses,
     Settings,
@@ -90,7 +91,6 @@ from tfbus.links.zenoh.sessions import (
 )
 from tfbus.tf_message import MalformedMessageError
 
-MAX_LINKS: Final = 10_000
 MAX_CHANNELS: Final = 128
 FIRST_WAIT: Final = 1.0
 """s; `ZenohWire.open` waits so long for a router."""
@@ -98,16 +98,15 @@ SETTLED: Final = 1.0
 """s after which a router has told a new publisher who subscribes to it."""
 LAST_WORDS: Final = 0.1
 """s without a message after which a link whose token has gone has left."""
-PAUSE: Final = 0.2, 0.6
-"""s between two attempts to have a session; drawn at random, because a router that starts again has many clients."""
+PAUSE: Final = 0.3, 0.7
+"""s between two sessions, or attempts to have one; drawn at random, because a router that starts again has many
+clients. A router whose next session comes too soon is no change for other routers."""
 PATIENCE: Final = 2.0, 5.0
 """s; so long a router may be connected without its token; drawn at random, so that not both begin anew at once."""
 PERIOD: Final = 1.0
 """s between two looks at the connected routers."""
 UNTIL_KNOWN: Final = 0.01
 """s from an event of zenoh until its session knows of it too, with some to spare."""
-PAUSE_OF_ROUTER: Final = 0.5
-"""s between two sessions of a router; a next one that comes too soon is no change for other routers."""
 NO_ROBOT: Final = "~"
 
 _TOKEN = re.compile(r"(~|[\w.-]{1,200})/@alive/([0-9a-f]{32})/([1-9]\d{0,8})", re.ASCII)
@@ -155,25 +154,27 @@ class ZenohWire(Wire):
         config: Settings | None = None,
         lease: float | None = None,
     ) -> None:
-        self.id: str = os.urandom(16).hex()
+        self.sender: bytes = os.urandom(16)
+        self.id: str = self.sender.hex()
         self.domain: str = f"tfbus/{domain}"
         self.own: str = f"{self.domain}/{robot or NO_ROBOT}"
-        # The first one is tried, or has answered.
-        self.addresses: deque[str] = deque(endpoints(connect or ()))
         self.is_router: bool = listen is not None
-        if listen is None and not self.addresses:
+        own, routers = endpoints(listen or ()), endpoints(connect or ())
+        if not (own if self.is_router else routers):
             raise ValueError(
                 "a link over zenoh needs a router: connect='tcp/host:7447' is one, and listen='tcp/0.0.0.0:7447' makes "
                 "this process one; the processes of one machine need none, and meet by the local link"
             )
-        self._config = session_config(listen, self.addresses, config, lease)
+        self._config = session_config(own or None, routers, config, lease)
+        # Of a client, which dials one of them; the first one is tried, or has answered.
+        self.addresses: deque[str] = deque(() if self.is_router else routers)
         self._session: _Session | None = None
         self._sessions = 0
         self._refused: OSError | None = None
         self._tried = threading.Event()
         # Set when the thread has something to do.
         self.changed: threading.Event = threading.Event()
-        self._stopped = False
+        self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._keep, name=THREAD, daemon=True)
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
@@ -233,7 +234,7 @@ class ZenohWire(Wire):
         """Have one session after another, until the wire is closed or cannot listen."""
         patience = LONGEST_CLOSE if self.is_router else FIRST_WAIT
         warns_at = monotonic() + patience
-        while not self._stopped:
+        while not self._stopped.is_set():
             try:
                 session = self._connect()
             except OSError as failure:
@@ -243,25 +244,31 @@ class ZenohWire(Wire):
                 if monotonic() > warns_at:
                     warns_at = math.inf
                     self.warn(self._lasting(failure))
-                self._wait(uniform(*PAUSE) / max(1, len(self.addresses)))
             else:
                 self._tried.set()
                 self._use(session)
+                self._finish(session)
                 warns_at = monotonic() + patience
             self.addresses.rotate(-1)
+            self._stopped.wait(uniform(*PAUSE) / max(1, len(self.addresses)))
         self._tried.set()
 
     def _use(self, session: "_Session") -> None:
         """Look after a session until it breaks, or the wire is closed."""
-        while not self._stopped and (pause := session.look(monotonic())) is not None:
-            self._wait(pause)
+        while not self._stopped.is_set() and (pause := session.look(monotonic())) is not None:
+            if self.changed.wait(pause):
+                # zenoh tells of an event before the session knows of it.
+                self._stopped.wait(UNTIL_KNOWN)
+            self.changed.clear()
+
+    def _finish(self, session: "_Session") -> None:
+        """Close a session, and wait for that; a second at most, unless the wire is closed."""
         self._session = None
-        if self._stopped:
+        if self._stopped.is_set():
             close_session(session.close)
         else:
-            session.end()
-            if self.is_router:
-                sleep(PAUSE_OF_ROUTER)
+            # zenoh may never close a session in which it has panicked, or whose router has.
+            session.end().join(CLOSING_TIME)
 
     def _lasting(self, failure: OSError) -> OSError:
         if self.is_router:
@@ -279,20 +286,13 @@ class ZenohWire(Wire):
         self._session = session = _Session(self, open_session(self._config, own))
         try:
             session.begin(self._sessions)
-        except zenoh.ZError as error:
-            self._session = None
-            # zenoh may not end it, if a client asks for tokens at this moment.
-            session.end().join(CLOSING_TIME)
-            raise os_error(error, "the session with a router broke at once") from error
+        except BaseException as error:  # It may panic.
+            self._finish(session)
+            raise os_error(error, "the new session broke at once") from error
         return session
 
-    def _wait(self, seconds: float) -> None:
-        if self.changed.wait(seconds) and not self._stopped:
-            sleep(UNTIL_KNOWN)
-        self.changed.clear()
-
     def _stop(self) -> None:
-        self._stopped = True
+        self._stopped.set()
         self.changed.set()
 
 
@@ -306,13 +306,11 @@ class _Session:
         self._wire = wire
         self._session = session
         self._publishers: dict[str, tuple[zenoh.Publisher, float]] = {}
-        # zenoh refuses to undeclare a publisher by which the event loop is publishing.
-        self._publishing = threading.Lock()
         self._tokens: list[zenoh.LivelinessToken] = []
         self._lock = threading.Lock()
         self._ended = False
         # The number of the newest session of each link that is present, and which of the wire's `hears` is for it.
-        self._present: dict[str, tuple[int, int]] = {}
+        self._present: dict[str, tuple[int, Hearing]] = {}
         # When each link that is present without a token has left.
         self._leaving: dict[str, float] = {}
         # The routers of tfbus that have a token, and since when each connected one has none.
@@ -325,15 +323,17 @@ class _Session:
     def begin(self, number: int) -> None:
         """Hear others, and then be present; raises `zenoh.ZError`."""
         session, wire = self._session, self._wire
+        if not wire.is_router and not session.info.routers_zid():
+            raise zenoh.ZError("what has answered is no router")
         session.info.declare_transport_events_listener(_directly(lambda _: wire.changed.set()))
         self._watch(f"{_ROUTERS}*", self._take_router)
         if wire.is_router:
             self._announce(f"{_ROUTERS}{session.info.zid()}")
         self._hear(f"{wire.domain}/@to/{wire.id}", self._take_sent)
-        for index, (robots, channel) in enumerate(wire.hears):
-            links = f"{wire.domain}/{robots_expression(robots)}"
-            self._hear(f"{links}/{channel}/*", partial(self._take_published, index))
-            self._watch(f"{links}/@alive/*/*", partial(self._take_token, index))
+        for hearing in wire.hears:
+            links = f"{wire.domain}/{robots_expression(hearing.robots)}"
+            self._hear(f"{links}/{hearing.channel}/*", partial(self._take_published, hearing))
+            self._watch(f"{links}/@alive/*/*", partial(self._take_token, hearing))
         self._announce(f"{wire.own}/@alive/{wire.id}/{number}")
 
     def look(self, now: float) -> float | None:
@@ -357,11 +357,8 @@ class _Session:
 
     def close(self) -> None:
         """Close the session; blocks."""
-        with self._publishing:
-            for publisher, _ in list(self._publishers.values()):
-                # Otherwise zenoh keeps a kB of each for ever.
-                with suppress(zenoh.ZError):
-                    publisher.undeclare()
+        # zenoh keeps a kB for ever of each publisher that is freed later than its session is closed.
+        self._publishers = {}
         self._session.close()
 
     # Declaring
@@ -404,29 +401,31 @@ class _Session:
 
     # Sending
 
-    def publisher(self, channel: str) -> tuple[zenoh.Publisher, float]:
+    def _publisher(self, channel: str) -> tuple[zenoh.Publisher, float]:
         """The publisher for a channel, and since when it is there; raises `zenoh.ZError` if it is new."""
-        if channel not in self._publishers:
-            if len(self._publishers) >= MAX_CHANNELS:
-                del self._publishers[next(iter(self._publishers))]
+        # The thread of the wire may forget all of them meanwhile.
+        publishers = self._publishers
+        if channel not in publishers:
+            if len(publishers) >= MAX_CHANNELS:
+                del publishers[next(iter(publishers))]
             key = f"{self._wire.own}/{channel}/{self._wire.id}"
             publisher = self._session.declare_publisher(key, congestion_control=_DROP, allowed_destination=_REMOTE)
-            self._publishers[channel] = publisher, monotonic()
-        return self._publishers[channel]
+            publishers[channel] = publisher, monotonic()
+        return publishers[channel]
 
     def is_heard(self, channel: str) -> bool:
         # The session may just have ended.
-        with suppress(zenoh.ZError), self._publishing:
-            publisher, since = self.publisher(channel)
+        with suppress(zenoh.ZError):
+            publisher, since = self._publisher(channel)
             return bool(publisher.matching_status.matching) or monotonic() < since + SETTLED  # type: ignore[attr-defined]
         return False
 
     def publish(self, channel: str, message: bytes) -> None:
-        with suppress(zenoh.ZError), self._publishing:
-            self.publisher(channel)[0].put(message)
+        with suppress(zenoh.ZError):
+            self._publisher(channel)[0].put(message)
 
     def send(self, link: str, message: bytes) -> bool:
-        key, sender = f"{self._wire.domain}/@to/{link}", bytes.fromhex(self._wire.id)
+        key, sender = f"{self._wire.domain}/@to/{link}", self._wire.sender
         with suppress(zenoh.ZError):
             self._session.put(key, message, attachment=sender, congestion_control=_DROP, allowed_destination=_REMOTE)
             return True
@@ -434,22 +433,24 @@ class _Session:
 
     # Receiving
 
-    def _take_published(self, index: int, sample: zenoh.Sample) -> None:
+    def _take_published(self, hearing: Hearing, sample: zenoh.Sample) -> None:
         link = str(sample.key_expr).rpartition("/")[2]
         with self._lock:
             known = self._present.get(link)
-            if known is not None and known[1] == index:
+            if known is not None and known[1] is hearing:
                 if link in self._leaving:
                     self._leaving[link] = monotonic() + LAST_WORDS
                 self._wire.receive(link, _content(sample))
 
     def _take_sent(self, sample: zenoh.Sample) -> None:
-        sender = b"" if sample.attachment is None or len(sample.attachment) != 16 else sample.attachment.to_bytes()
+        sender = sample.attachment
+        if sender is None or len(sender) != len(self._wire.sender):
+            return
         with self._lock:
-            if sender and not self._ended:
-                self._wire.receive(sender.hex(), _content(sample))
+            if not self._ended:
+                self._wire.receive(sender.to_bytes().hex(), _content(sample))
 
-    def _take_token(self, index: int, sample: zenoh.Sample) -> None:
+    def _take_token(self, hearing: Hearing, sample: zenoh.Sample) -> None:
         wire, key = self._wire, str(sample.key_expr)[len(self._wire.domain) + 1 :]
         found = _TOKEN.fullmatch(key)
         if found is None:
@@ -457,7 +458,7 @@ class _Session:
                 wire.receive("", MalformedMessageError("token", f"no link has the token {key[:100]}"))
             return
         robot, link, number = found[1].replace(NO_ROBOT, ""), found[2], int(found[3])
-        if link == wire.id or index != next((k for k, one in enumerate(wire.hears) if one.matches(robot)), None):
+        if link == wire.id or first_match(wire.hears, robot) is not hearing:
             return
         with self._lock:
             newest = self._present[link][0] if link in self._present else 0
@@ -468,7 +469,7 @@ class _Session:
             elif number > newest or (number == newest and link in self._leaving):
                 self._leave(link)
                 if len(self._present) < MAX_LINKS and not self._ended:
-                    self._present[link] = number, index
+                    self._present[link] = number, hearing
                     wire.receive(link, Joined(robot))
 
     def _leave(self, link: str) -> None:
