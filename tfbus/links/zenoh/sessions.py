@@ -27,17 +27,18 @@ LEASE: Final = 4.0
 OPENING_TIME: Final = 2.0
 """s; a router that has not answered by then is passed over for the next one."""
 UNSENT: Final = 8
-"""So many buffers of 64 KiB may wait for the router before messages are dropped; zenoh's two are full whenever its
-thread waits for a CPU for some ms."""
+"""Buffers of 64 KiB that may wait for the router before messages are dropped. zenoh's default is two, which are full
+whenever its thread waits for a CPU for some ms."""
 MAX_LINKS: Final = 10_000
-"""A router takes so many sessions, and a link hears so many others; zenoh's own thousand sessions would be full without
-a word."""
+"""A link hears so many others, and a router takes so many sessions; zenoh's default is a thousand, and it refuses more
+of them silently."""
 RECEIVING_THREADS: Final = 32
-"""of a router. zenoh ends a connection that is cut off by a call that waits 10 s in one of them (its issue 2718); after
-two such losses both of its usual two waited, and the router passed on nothing meanwhile."""
+"""Threads of a router. zenoh ends a connection that is cut off by a call that waits 10 s in one of them (its issue
+2718). By default there are two: after two such losses both waited, and the router passed on nothing meanwhile."""
 CLOSING_TIME: Final = 1.0
+"""s that the event loop waits for the end of a session."""
 LONGEST_CLOSE: Final = 15.0
-"""s; so long the event loop and the interpreter wait."""
+"""s that the interpreter waits for the end of all sessions, and the opening of a link for a router of its own."""
 THREAD: Final = "tfbus and zenoh end"
 """The name of each thread for whose end the interpreter waits."""
 _first_user: int | None = None

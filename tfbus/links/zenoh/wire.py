@@ -241,7 +241,7 @@ class ZenohWire(Wire):
                 if self.is_router and not self._tried.is_set():
                     self._refused = failure
                     break
-                if monotonic() > warns_at:
+                if monotonic() > warns_at and not self._stopped.is_set():
                     warns_at = math.inf
                     self.warn(self._lasting(failure))
             else:
