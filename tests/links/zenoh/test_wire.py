@@ -297,6 +297,7 @@ async def test_a_router_that_is_stopped_holds_nobody_up(address: str, domain: st
             listening(domain, connect=address) as two,
         ):
             await met(one, two)
+            assert one.warnings == []
 
 
 # The beginning and the end

@@ -233,7 +233,7 @@ class ZenohWire(Wire):
     def _keep(self) -> None:
         """Have one session after another, until the wire is closed or cannot listen."""
         patience = LONGEST_CLOSE if self.is_router else FIRST_WAIT
-        warns_at = monotonic() + patience
+        warns_at, failures = monotonic() + patience, 0
         while not self._stopped.is_set():
             try:
                 session = self._connect()
@@ -241,14 +241,16 @@ class ZenohWire(Wire):
                 if self.is_router and not self._tried.is_set():
                     self._refused = failure
                     break
-                if monotonic() > warns_at and not self._stopped.is_set():
+                failures += 1
+                is_late = monotonic() > warns_at and failures >= len(self.addresses)
+                if is_late and not self._stopped.is_set():
                     warns_at = math.inf
                     self.warn(self._lasting(failure))
             else:
                 self._tried.set()
                 self._use(session)
                 self._finish(session)
-                warns_at = monotonic() + patience
+                warns_at, failures = monotonic() + patience, 0
             self.addresses.rotate(-1)
             self._stopped.wait(uniform(*PAUSE) / max(1, len(self.addresses)))
         self._tried.set()
