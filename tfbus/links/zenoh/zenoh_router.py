@@ -36,7 +36,8 @@ class ZenohRouter(AsyncOnly):
     Raises
     ------
     ValueError, TypeError
-        If zenoh does not take an address or a setting, or an argument has another type.
+        If there is no address to listen at, zenoh does not take an address or a setting, or an argument has another
+        type.
     OSError
         If the file of settings cannot be read; on entering, if the router cannot listen where it should, or zenoh
         finds that its rules do not fit together.
