@@ -39,14 +39,14 @@ SHORT = FutureExtrapolationError(child="base", stamp=9, oldest=1, newest=5, auth
     ],
 )
 def test_a_question_is_read_as_it_was_written(message: RemoteQuestion) -> None:
-    assert read_question(write_question(message)) == message
+    assert read_question(RemoteQuestion, write_question(message)) == message
 
 
 def test_so_large_a_message_is_read_and_no_larger_one() -> None:
     largest = write_question(QUESTION).ljust(MAX_TEXT)
-    assert read_question(largest) == QUESTION
+    assert read_question(RemoteQuestion, largest) == QUESTION
     with pytest.raises(ValueError, match=f"{MAX_TEXT + 1} bytes, more than {MAX_TEXT}"):
-        read_question(largest + b" ")
+        read_question(RemoteQuestion, largest + b" ")
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_so_large_a_message_is_read_and_no_larger_one() -> None:
 )
 def test_other_bytes_are_no_question_and_no_answer(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"."):
-        read_question(data)
+        read_question(RemoteQuestion, data)
     error = read_answer(data, "tf", "r1")
     assert isinstance(error, RemoteLookupError)
     assert (error.domain, error.robot, error.reason) == ("tf", "r1", "malformed")
@@ -88,14 +88,14 @@ def fields_of(data: bytes, **changes: Any) -> bytes:
 def test_a_question_with_an_integer_of_more_than_64_bits_is_refused(name: str, digits: int) -> None:
     data = fields_of(write_question(QUESTION), **{name: None}).replace(b"null", b"9" * digits)
     with pytest.raises(ValueError, match=f"{digits} digits does not fit 64 bits"):
-        read_question(data)
+        read_question(RemoteQuestion, data)
 
 
 @pytest.mark.parametrize("name", ["target", "source", "fixed"])
 def test_a_question_with_a_longer_name_than_a_message_of_samples_may_have_is_refused(name: str) -> None:
-    read_question(fields_of(write_question(QUESTION), **{name: "x" * 1_024}))
+    read_question(RemoteQuestion, fields_of(write_question(QUESTION), **{name: "x" * 1_024}))
     with pytest.raises(ValueError, match="more than 1024 bytes"):
-        read_question(fields_of(write_question(QUESTION), **{name: "\u20ac" * 342}))
+        read_question(RemoteQuestion, fields_of(write_question(QUESTION), **{name: "\u20ac" * 342}))
 
 
 def nested(depth: int) -> bytes:
@@ -228,7 +228,7 @@ def test_one_wrong_field_or_byte_raises_nothing_but_a_value_error(message: bytes
         place = data.draw(st.integers(0, len(message) - 1))
         bad = message[:place] + data.draw(st.binary(max_size=3)) + message[place + data.draw(st.integers(0, 9)) :]
     try:
-        read_question(bad)
+        read_question(RemoteQuestion, bad)
     except ValueError as error:
         assert len(str(error)) < 1_000
     answer = read_answer(bad, "tf", None, QUESTION)

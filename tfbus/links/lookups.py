@@ -335,9 +335,9 @@ class BufferServer(AsyncOnly):
         """Answer a question that can be answered now, else let it wait. Called by the link."""
         key = asker, number
         try:
-            question = read_question(data)
-        except ValueError as error:
-            self._refuse(*key, "malformed", f"the question cannot be read: {error}")
+            question = read_question(RemoteQuestion, data)
+        except MalformedMessageError as error:
+            self._refuse(*key, "malformed", f"the question cannot be read: {error.detail}")
             return
         if not self._admit():
             self._refuse(*key, "busy", f"more than {self._rate:g} lookups come in a second")

@@ -18,9 +18,9 @@ sender holds. The samples themselves are a TFMessage behind that. Little endian:
     clocks       the section of `tfbus.links.clocks`, if the flags say so
 
 The kinds are those of `tfbus.links.replica`, and those of the past and of lookups. Questions are JSON behind version
-and kind. A question of a lookup and its answer have a number of 8 bytes before the JSON, by which an answer finds its
-question; a number alone cancels the question. Reading a message costs time in proportion to its bytes; handling an
-entry may cost more, so both have a limit.
+and kind: the fields of `ChangesQuestion`, `PastQuestion` or `RemoteQuestion`. A question of a lookup and its answer
+have a number of 8 bytes before the JSON, by which an answer finds its question; a number alone cancels the question.
+Reading a message costs time in proportion to its bytes; handling an entry may cost more, so both have a limit.
 
 An error of a lookup travels with its facts, see `tfbus.errors.TransformError.to_dict`. `read_question` and
 `read_answer` are the door for the data of strangers. They check what Python would trip over later: integers that are
@@ -34,7 +34,7 @@ import struct
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from sys import intern
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -109,6 +109,7 @@ _FINAL, _PARTIAL, _HAS_TIME, _SERVES, _HAS_CLOCKS = 1, 2, 4, 8, 16
 _NO_CLOCK = -(2**63)
 _BUS = 16
 
+QuestionT = TypeVar("QuestionT", bound=PlainData)
 NOTHING = Claim(0, 0, 0)
 Way = tuple[bytes, tuple[bytes, ...]]
 """A bus that is reached, and the buses on the way there."""
@@ -216,11 +217,6 @@ def write_message(out: Outgoing, entries: Sequence[Entry] = ()) -> bytes:
     if len(message) > MAX_BYTES:
         raise ValueError(f"a message of {len(samples)} samples has {len(message)} bytes, more than {MAX_BYTES}")
     return message
-
-
-def write_text(kind: Kind, fields: dict[str, Any]) -> bytes:
-    """The bytes of a message of JSON."""
-    return write_body(kind, json.dumps(fields).encode())
 
 
 def write_body(kind: Kind, body: bytes) -> bytes:
@@ -400,20 +396,6 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
     yield heard
 
 
-def read_fields(data: bytes) -> dict[str, Any]:
-    """The JSON object in the body of a text.
-
-    Raises
-    ------
-    MalformedMessageError
-        If there is none.
-    """
-    try:
-        return _read(data)
-    except ValueError as error:
-        raise MalformedMessageError("text", str(error)) from None
-
-
 def _read_head(
     kind: Kind, data: bytes
 ) -> Generator[None, None, tuple[Heard, int, list[_Told], list[tuple[str, bool]], dict[int, Belief]]]:
@@ -509,7 +491,35 @@ def _with_belief(sample: FromLink, belief: Belief) -> FromLink:
     return found
 
 
-# Lookups
+# Questions
+
+
+@dataclass(slots=True)
+class ChangesQuestion(PlainData):
+    """A question for the changes of a copy.
+
+    Attributes
+    ----------
+    since : int
+        The asker knows the changes up to this sequence.
+    frames : tuple of str or None
+        The frames that the asker wants; None for all.
+    """
+
+    since: int
+    frames: tuple[str, ...] | None
+
+    def __post_init__(self) -> None:
+        if self.since < 0:
+            raise ValueError(f"a sequence is not negative, got {self.since}")
+
+
+@dataclass(slots=True)
+class PastQuestion(PlainData):
+    """A question for the samples of the last `seconds`, of the frames whose names come after `after`."""
+
+    seconds: float
+    after: str
 
 
 @dataclass(slots=True)
@@ -535,27 +545,30 @@ class RemoteQuestion(PlainData):
     covariance: bool = False
 
 
-def write_question(question: RemoteQuestion) -> bytes:
+def write_question(question: PlainData) -> bytes:
     """The bytes of a question."""
     return json.dumps(question.to_dict()).encode()
 
 
-def read_question(data: bytes) -> RemoteQuestion:
+def read_question(kind: type[QuestionT], data: bytes) -> QuestionT:
     """The question in some bytes.
 
     Raises
     ------
-    ValueError
-        If they are no question, or it has an integer of more than 64 bits or a name of more than `MAX_NAME` bytes.
+    MalformedMessageError
+        If they are no such question, or it has an integer of more than 64 bits or a name of more than `MAX_NAME` bytes.
     """
-    fields = _read(data)
-    for name, value in fields.items():
-        if isinstance(value, str) and len(value.encode()) > MAX_NAME:
-            raise ValueError(f"its field {_shown(name)} has more than {MAX_NAME} bytes")
     try:
-        return RemoteQuestion.from_dict(fields)
+        fields = _read(data)
+        for name, value in fields.items():
+            if isinstance(value, str) and len(value.encode()) > MAX_NAME:
+                raise ValueError(f"its field {_shown(name)} has more than {MAX_NAME} bytes")
+        return kind.from_dict(fields)
     except ValueError as error:
-        raise ValueError(str(error)[:_SHOWN]) from None
+        raise MalformedMessageError("text", str(error)[:_SHOWN]) from None
+
+
+# Answers of lookups
 
 
 def write_answer(answer: TransformStamped | Exception) -> bytes:
