@@ -446,11 +446,10 @@ class DomainEnd(Endpoint):
         """Read what signs have told of clocks; once that of a peer is known, correct what it told before."""
         self.clocks.settle()
         self._tell_offsets()
-        is_measured = self.clocks.is_measured(peer.id)
-        if peer.is_placed or is_measured is False:
+        if peer.is_placed or not self.clocks.is_measured(peer.id):
             return
         peer.is_placed = True
-        for known in list(self.relay.replica.entries.values()) if is_measured else ():
+        for known in list(self.relay.replica.entries.values()):
             source, sample = known.source, known.sample
             if source.peer is not peer or source.clock is not None or not isinstance(sample, FromLink):
                 continue
