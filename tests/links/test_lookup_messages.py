@@ -21,12 +21,17 @@ from tfbus import (
 )
 from tfbus.links.message import (
     MAX_TEXT,
+    Kind,
     RemoteQuestion,
+    Text,
     read_answer,
+    read_message,
     read_question,
     write_answer,
+    write_body,
     write_question,
 )
+from tfbus.tf_message import MalformedMessageError
 
 SHORT = FutureExtrapolationError(child="base", stamp=9, oldest=1, newest=5, authority="odometry")
 
@@ -43,10 +48,13 @@ def test_a_question_is_read_as_it_was_written(message: RemoteQuestion) -> None:
 
 
 def test_so_large_a_message_is_read_and_no_larger_one() -> None:
-    largest = write_question(QUESTION).ljust(MAX_TEXT)
-    assert read_question(RemoteQuestion, largest) == QUESTION
-    with pytest.raises(ValueError, match=f"{MAX_TEXT + 1} bytes, more than {MAX_TEXT}"):
-        read_question(RemoteQuestion, largest + b" ")
+    largest = bytes(8) + write_question(QUESTION).ljust(MAX_TEXT)
+    (text,) = read_message(write_body(Kind.LOOKUP, largest))
+    assert isinstance(text, Text)
+    assert read_question(RemoteQuestion, text.data[8:]) == QUESTION
+    with pytest.raises(MalformedMessageError) as refused:
+        list(read_message(write_body(Kind.LOOKUP, largest + b" ")))
+    assert refused.value.reason == "oversized"
 
 
 @pytest.mark.parametrize(

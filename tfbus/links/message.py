@@ -71,7 +71,7 @@ MAX_BYTES = 2**22
 MAX_HEAD = 2**20
 """The largest part of a message before its samples."""
 MAX_TEXT = 2**17
-"""The largest message of JSON."""
+"""The most bytes of JSON in one message."""
 MAX_DEPTH = 16
 """The deepest nesting of values; an error with its cause takes two levels."""
 MAX_ENTRIES = 10_000
@@ -91,6 +91,8 @@ _HELD: set[tuple[str, str, str]] = set()
 """Parents, children and authorities that a message can hold, of the last calls of `can_hold`."""
 _MOST_HELD = 2_000
 _MOST_DIGITS = 20
+_BEFORE_TEXT = 10
+"""The bytes before the JSON of a lookup: version, kind and number."""
 _SHOWN = 200
 
 _ARGUMENT_ERRORS: dict[str, type[Exception]] = {"TypeError": TypeError, "ValueError": ValueError}
@@ -354,7 +356,7 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
     if kind is None:
         raise MalformedMessageError("version", f"expected a message of version {VERSION}, got {data[:2]!r}")
     if kind in TEXTS:
-        if len(data) > MAX_TEXT:
+        if len(data) > MAX_TEXT + _BEFORE_TEXT:
             raise MalformedMessageError("oversized", f"a text of {len(data)} bytes, more than {MAX_TEXT}")
         yield Text(kind, data[2:])
         return
@@ -624,8 +626,6 @@ def _check_answers(answer: TransformStamped, question: RemoteQuestion) -> None:
 
 def _read(data: bytes) -> dict[str, Any]:
     """The JSON object in some bytes; raises `ValueError` if they are none, or beyond a bound."""
-    if len(data) > MAX_TEXT:
-        raise ValueError(f"{len(data)} bytes, more than {MAX_TEXT}")
     try:
         fields = _decoder.decode(data.decode())
     except RecursionError:
