@@ -62,7 +62,7 @@ from tfbus.links.replica import (
 )
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
-from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode, decode_in_parts, encode, refusal
+from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode_in_parts, encode, refusal
 from tfbus.uncertainty.answers import UncertainTransform
 
 VERSION = 6
@@ -79,17 +79,12 @@ MAX_SAMPLES = 10_000
 """The largest batch that is sent or accepted: a bus publishes it in one turn of the loop, all or nothing."""
 LONGEST_WAY = 8
 """The most buses on the way to a bus."""
-_LARGE = 2**15
-"""Bytes; a message beyond is read in parts."""
 _PART = 200
 """The samples or entries of a large message that are handled before other tasks may have their turn."""
 _PART_OF_HEAD = 1_000
 _BELIEFS_AT_ONCE = 50
 _LONGEST_AUTHORITY = 65_535
 FIRST_STAMP, END_OF_STAMPS = -(2**31) * SECOND, 2**31 * SECOND
-_HELD: set[tuple[str, str, str]] = set()
-"""Parents, children and authorities that a message can hold, of the last calls of `can_hold`."""
-_MOST_HELD = 2_000
 _MOST_DIGITS = 20
 _BEFORE_TEXT = 10
 """The bytes before the JSON of a lookup: version, kind and number."""
@@ -249,17 +244,12 @@ def sendable(entry: Entry, refuse: Callable[[str, Exception], object]) -> Entry 
 
 def can_hold(sample: TransformStamped) -> bool:
     """Whether a message can hold a sample."""
-    # The same names come again with each sample of a frame.
-    names = sample.parent, sample.child, sample.authority
-    if names in _HELD:
-        return FIRST_STAMP <= sample.stamp < END_OF_STAMPS
-    if reason_not_to_send(sample) is not None:
-        return False
-    if len(_HELD) >= _MOST_HELD:
-        _HELD.clear()
-    if len(sample.authority) < _MOST_HELD:
-        _HELD.add(names)
-    return True
+    parent, child, stamp, _, authority, _ = sample._fields
+    names = parent + child + authority
+    # The usual case, in which a letter is a byte.
+    if len(names) <= MAX_NAME and names.isascii():
+        return FIRST_STAMP <= stamp < END_OF_STAMPS
+    return reason_not_to_send(sample) is None
 
 
 def reason_not_to_send(sample: TransformStamped) -> InvalidTransformError | None:
@@ -371,16 +361,11 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
         raise MalformedMessageError("head", "a name in a message is no UTF-8") from None
     samples: list[FromLink | None] = []
     if tags or end < len(data):
-        payload = data[end:]
-        if len(data) > _LARGE:
-            yield None
-            for decoded in decode_in_parts(payload, _PART, ReceivedTransform, tags=tags):
-                samples += decoded.samples
-                heard.errors += decoded.errors
+        for decoded in decode_in_parts(data[end:], _PART, ReceivedTransform, tags=tags):
+            if samples:
                 yield None
-        else:
-            decoded = decode(payload, tags, ReceivedTransform)
-            samples, heard.errors = [*decoded.samples], decoded.errors
+            samples += decoded.samples
+            heard.errors += decoded.errors
     for place, belief in beliefs.items():
         sample = samples[place]
         samples[place] = None if sample is None else _with_belief(sample, belief)
