@@ -209,10 +209,7 @@ class RemoteLookups:
             raise self._error(robot, "silent", f"it has not answered within {timeout + PATIENCE:g} s")
         if pending.answer is None:
             raise self._error(robot, "lost", "it has gone" if self._is_open else "this link has ended")
-        answer = read_answer(pending.answer, self._domain, robot, question)
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
+        return read_answer(pending.answer, self._domain, robot, question)
 
     def _error(self, robot: str | None, reason: str, detail: str) -> RemoteLookupError:
         return RemoteLookupError(domain=self._domain, robot=robot, reason=reason, detail=detail)

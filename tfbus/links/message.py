@@ -25,7 +25,7 @@ Reading a message costs time in proportion to its bytes; handling an entry may c
 An error of a lookup travels with its facts, see `tfbus.errors.TransformError.to_dict`. `read_question` and
 `read_answer` are the door for the data of strangers. They check what Python would trip over later: integers that are
 no stamps, values inside values, names of any length, errors that no lookup raises, and answers to another question.
-They raise nothing but a `ValueError`.
+For bytes with any of these, they raise one kind of error each.
 """
 
 import enum
@@ -572,20 +572,25 @@ def write_answer(answer: TransformStamped | Exception) -> bytes:
 
 def read_answer(
     data: bytes, domain: str, robot: str | None, question: RemoteQuestion | None = None
-) -> TransformStamped | Exception:
-    """The answer in some bytes, or the error to raise; a `RemoteLookupError` if the bytes are neither.
+) -> TransformStamped:
+    """The answer in some bytes; with a question, an answer about other frames or another stamp is none.
 
-    With a question, an answer about other frames or another stamp is none.
+    Raises
+    ------
+    TransformError, TypeError, ValueError
+        The error in the bytes, if the lookup has failed.
+    RemoteLookupError
+        If the bytes are neither an answer nor such an error.
     """
     try:
         answer = _answer_of(_read(data))
         if question is not None and isinstance(answer, TransformStamped):
             _check_answers(answer, question)
-            if question.covariance and not isinstance(answer, UncertainTransform):
-                raise ValueError("it has no covariance")
     except Exception as error:  # noqa: BLE001 - the asker gets one kind of error for all bad answers
         detail = f"not an answer: {str(error)[:_SHOWN]}"
-        return RemoteLookupError(domain=domain, robot=robot, reason="malformed", detail=detail)
+        raise RemoteLookupError(domain=domain, robot=robot, reason="malformed", detail=detail) from None
+    if isinstance(answer, Exception):
+        raise answer
     return answer
 
 
@@ -607,6 +612,8 @@ def _check_answers(answer: TransformStamped, question: RemoteQuestion) -> None:
         raise ValueError(f"it is about {_shown(answer.parent)} and {_shown(answer.child)}")
     if not (answer.static or isinstance(question.at, Latest) or answer.stamp == question.at):
         raise ValueError(f"it is of the stamp {answer.stamp}, not of {question.at}")
+    if question.covariance and not isinstance(answer, UncertainTransform):
+        raise ValueError("it has no covariance")
 
 
 def _read(data: bytes) -> dict[str, Any]:
