@@ -3,7 +3,7 @@
 from typing import Any
 
 import pytest
-from support.domains import Network, Process, Stranger, World
+from support.domains import Network, Process, Stranger, World, write_text
 from support.memory_wire import MemoryNetwork
 from support.samples import moving, static
 
@@ -11,7 +11,7 @@ from tfbus import Bus, TransformStamped
 from tfbus.links import DomainLink
 from tfbus.links.channels import LONGEST_FILTER, MOST_FILTERS, filter_name
 from tfbus.links.domain import MOST_ROBOTS
-from tfbus.links.message import Heard, Kind, read_message, write_text
+from tfbus.links.message import Heard, Kind, read_message
 from tfbus.links.relay import relay_of
 from tfbus.links.replica import ReceivedBatch
 

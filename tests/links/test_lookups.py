@@ -436,9 +436,9 @@ async def test_what_is_no_question_is_refused_and_counted_and_harms_nobody() -> 
         await until(lambda: len(stranger.bodies) == len(bad))
         assert [int.from_bytes(body[:8], "little") for _, body in stranger.bodies] == list(range(len(bad)))
         for _, body in stranger.bodies:
-            error = read_answer(body[8:], "tf", None)
-            assert isinstance(error, RemoteLookupError)
-            assert error.reason == "malformed"
+            with pytest.raises(RemoteLookupError) as refused:
+                read_answer(body[8:], "tf", None)
+            assert refused.value.reason == "malformed"
         stranger.say(scene.link.id, Kind.LOOKUP, b"")
         assert (await scene.lookup("map", "base")).static
         assert scene.counts == {"answered": 1, "refused": {"malformed": len(bad)}}

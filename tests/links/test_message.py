@@ -27,19 +27,21 @@ from tfbus.links.message import (
     MAX_TEXT,
     TEXTS,
     VERSION,
+    ChangesQuestion,
     Heard,
     Kind,
     Outgoing,
+    PastQuestion,
     Text,
     can_hold,
     kind_of,
-    read_fields,
     read_message,
+    read_question,
     reason_not_to_send,
     split_clocks,
     write_body,
     write_message,
-    write_text,
+    write_question,
 )
 from tfbus.links.replica import Claim, Entry, OutgoingBatch, ReceivedBatch, RemovedFrame
 from tfbus.tf_message import MalformedMessageError, encode
@@ -248,13 +250,13 @@ def test_a_text_has_its_body_behind_version_and_kind(body: bytes, kind: Kind) ->
     assert list(read_message(write_body(kind, body))) == [Text(kind, body)]
 
 
-def test_the_fields_of_a_text_are_a_json_object() -> None:
-    (text,) = read_message(write_text(Kind.QUESTION, {"since": 3, "frames": None}))
-    assert isinstance(text, Text)
-    assert read_fields(text.data) == {"since": 3, "frames": None}
-    for bad in (b"", b"\xff", b"[]", b"3", b"{", b"[" * 100_000, b'{"a": 1}x', json.dumps("a").encode()):
+@pytest.mark.parametrize("question", [ChangesQuestion(3, ("a", "b")), ChangesQuestion(0, None), PastQuestion(5.0, "a")])
+def test_a_question_is_a_json_object_of_its_fields(question: ChangesQuestion | PastQuestion) -> None:
+    body = write_question(question)
+    assert read_question(type(question), body) == question
+    for bad in (b"", b"\xff", b"[]", b"3", b"{", b"{}", b"[" * 100_000, body + b"x", json.dumps("a").encode()):
         with pytest.raises(MalformedMessageError) as refused:
-            read_fields(bad)
+            read_question(type(question), bad)
         assert refused.value.reason == "text"
 
 

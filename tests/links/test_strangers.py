@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import strategies as some
-from support.domains import Network, Stranger, World
+from support.domains import Network, Stranger, World, write_text
 from support.samples import moving, static
 
 from tfbus import PeerLost, PeerRejected, TransformStamped
 from tfbus.links.endpoint import MAX_AUTHORITIES
-from tfbus.links.message import VERSION, Kind, Outgoing, read_message, write_body, write_message, write_text
+from tfbus.links.message import VERSION, Kind, Outgoing, read_message, write_body, write_message
 from tfbus.links.relay import LARGEST_JUMP
 from tfbus.links.replica import MANY_ORIGINS, Claim, OutgoingBatch, RemovedFrame
 
@@ -354,14 +354,15 @@ def test_a_subscriber_may_change_the_frames_of_a_lost_peer_when_it_hears_of_it()
 
 def test_a_question_is_answered_with_what_this_link_brings_and_a_bad_one_is_refused(scene: Scene) -> None:
     scene.process.say(moving("map", "m", 1))
-    for fields in ({"since": 0}, {"since": 0, "frames": ["m", "x"]}, {"since": 10**9, "frames": []}):
-        scene.stranger.say_bytes(write_text(Kind.QUESTION, fields))
+    for since, names in ((0, None), (0, ["m", "x"]), (10**9, [])):
+        scene.stranger.say_bytes(write_text(Kind.QUESTION, {"since": since, "frames": names}))
     frames = []
     for message in scene.stranger.heard(Kind.ANSWER):
         (heard,) = read_message(message)
         frames.append({sample.child for entry in heard.entries for sample in entry.samples})  # type: ignore[union-attr]
     assert frames == [{"own", "m"}, {"m"}, set()]
-    bad: list[dict[str, Any]] = [{}, {"since": -1}, {"since": 2**64}, {"since": 1.0}, {"since": True}]
+    bad: list[dict[str, Any]] = [{}, {"since": 0}]
+    bad += [{"since": since, "frames": None} for since in (-1, 2**64, 1.0, True)]
     bad += [{"since": 0, "frames": frames} for frames in ("m", 5, [5], {"m": 1})]
     for fields in bad:
         scene.stranger.say_bytes(write_text(Kind.QUESTION, fields))

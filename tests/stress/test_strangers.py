@@ -13,7 +13,7 @@ import anyio.lowlevel
 import anyio.to_thread
 import pytest
 from support.damage import damaged
-from support.domains import Network, World
+from support.domains import Network, World, write_text
 from support.domains import Stranger as WrittenLink
 from support.local_links import RawPeer, files_in, framed
 from support.memory_wire import MemoryNetwork
@@ -37,7 +37,6 @@ from tfbus.links.message import (
     write_body,
     write_message,
     write_question,
-    write_text,
 )
 from tfbus.links.replica import (
     Claim,
@@ -133,7 +132,7 @@ def false_counts(_: Scene) -> Iterator[bytes]:
 
 def ill_questions(_: Scene) -> Iterator[bytes]:
     for since in (-1, 2**64, 10**400, 1.5, None, True, "0"):
-        yield write_text(Kind.QUESTION, {"since": since})
+        yield write_text(Kind.QUESTION, {"since": since, "frames": None})
     for frames in ("arm", [1], {"arm": 1}, ["\ud800"], [["arm"]]):
         yield write_text(Kind.QUESTION, {"since": 0, "frames": frames})
     for seconds in (float("nan"), float("inf"), -1, 10**400, True, None):
@@ -164,11 +163,11 @@ def own_origin(scene: Scene) -> Iterator[bytes]:
 def removals_beyond_the_bound(scene: Scene) -> Iterator[bytes]:
     """A frame moves, is removed, and its removal is pushed out by others before it has settled."""
     yield live(OutgoingBatch(BUS, scene.number, (moving("map", "gone", 1),)))
-    yield write_text(Kind.QUESTION, {"since": 0})
+    yield write_text(Kind.QUESTION, {"since": 0, "frames": None})
     yield live(RemovedFrame(BUS, scene.number + 1, "gone"))
     for first in range(2, 12_002, 4_000):
         yield live(*(RemovedFrame(BUS, scene.number + first + k, f"r{first + k}") for k in range(4_000)))
-    yield write_text(Kind.QUESTION, {"since": 0})
+    yield write_text(Kind.QUESTION, {"since": 0, "frames": None})
 
 
 def many_origins(scene: Scene) -> Iterator[bytes]:
@@ -485,7 +484,7 @@ async def test_questions_are_answered_one_a_link_and_leave_half_of_the_time_to_o
             asker = network.wire()
             await asker.open([Hearing("*", "all")], lambda _, item: answers.append(item), answers.append)
             for _ in range(1_000):
-                asker.send(link.id, write_text(Kind.QUESTION, {"since": 0}))
+                asker.send(link.id, write_text(Kind.QUESTION, {"since": 0, "frames": None}))
             await until(lambda: any(kind_of(item) is Kind.ANSWER for item in answers if isinstance(item, bytes)))
             await until(lambda: link.statistics().queue.pending == 0)
             count = sum(kind_of(item) is Kind.ANSWER for item in answers if isinstance(item, bytes))

@@ -4,6 +4,7 @@ Everything but the event loop and the sockets is real. A run is given by its see
 """
 
 import heapq
+import json
 import random
 from collections.abc import Callable, Coroutine, Iterable, Sequence
 from contextlib import suppress
@@ -19,7 +20,7 @@ from tfbus.links.clocks import OwnClock
 from tfbus.links.domain import DomainEnd
 from tfbus.links.endpoint import Endpoint
 from tfbus.links.link import ReceiveQueue
-from tfbus.links.message import NOTHING, Kind, Outgoing, kind_of, write_message
+from tfbus.links.message import NOTHING, Kind, Outgoing, kind_of, write_body, write_message
 from tfbus.links.relay import relay_of
 from tfbus.links.replica import Claim, OutgoingBatch, RemovedFrame
 from tfbus.links.ros.foreign_end import ForeignEnd
@@ -35,6 +36,11 @@ def finish(call: Coroutine[Any, Any, object]) -> None:
     """Run a coroutine that never waits."""
     with suppress(StopIteration):
         call.send(None)
+
+
+def write_text(kind: Kind, fields: object) -> bytes:
+    """A message of JSON, which may be of no use."""
+    return write_body(kind, json.dumps(fields).encode())
 
 
 class SkewedClock(SystemClock):

@@ -143,9 +143,7 @@ class Channels:
             for sample in entry.samples:
                 newest.pop(sample.child, None)
                 if not sample.static:
-                    newest[sample.child] = OutgoingBatch(
-                        entry.origin, entry.sequence, (sample,), entry.clock, entry.shift
-                    )
+                    newest[sample.child] = replace(entry, samples=(sample,))
 
     def _write(self, channel: _Channel, entries: Sequence[Entry]) -> None:
         """One message of all entries if possible, else several; a batch that is too large is left out and reported."""

@@ -37,7 +37,9 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, NamedTuple, cast
+from typing import Final, NamedTuple
+
+import numpy as np
 
 from tfbus.clock import Clock, SimulatedClock
 from tfbus.stamps import SECOND, to_seconds
@@ -95,22 +97,22 @@ class OwnClock:
         """The clock less the steady clock, in ns; None if it does not run by itself, or has no time yet."""
         if not self.runs or (self._may_be_unset and not self._clock.is_set):  # type: ignore[attr-defined]
             return None
-        before = self.steady()
-        now = self._now()
-        took = self.steady() - before
+        took, base = self._read()
         for _ in range(_READINGS):
             if took <= _SLOW_READING:
                 break
             # The thread was interrupted between the readings.
-            again = self.steady()
-            later = self._now()
-            took_again = self.steady() - again
-            if took_again < took:
-                before, now, took = again, later, took_again
-        base = now - before - took // 2
+            took, base = min((took, base), self._read())
         if self._base is None or abs(base - self._base) > _STILL:
             self._base = base
         return self._base
+
+    def _read(self) -> tuple[int, int]:
+        """The time that a reading of both clocks has taken, and the base by it, in ns."""
+        before = self.steady()
+        now = self._now()
+        took = self.steady() - before
+        return took, now - before - took // 2
 
 
 class Exchange(NamedTuple):
@@ -180,7 +182,13 @@ class ClockFilter:
             self._exchanges.clear()
             self._steady = None
         self._exchanges.append(found)
-        self._best = min(self._exchanges, key=_grown)
+        self._best = min(self._exchanges, key=lambda one: one.bound_at(arrived))
+
+    def steps_to(self, base: int | None) -> bool:
+        """Whether a base of the peer's bus shows that its clock was set since it told the last one."""
+        # Read once: another thread may call this.
+        last = self.base
+        return base is not last if base is None or last is None else abs(base - last) > STEP
 
     def was_set(self) -> None:
         """Note that the clock of either bus was set: earlier exchanges no longer show its drift."""
@@ -227,18 +235,11 @@ class ClockFilter:
         if len(recent) < 3 or recent[-1].at - recent[0].at < _SHORTEST_FIT:
             return None
         weights = [1.0 / one.bound**2 for one in recent]
-        total = sum(weights)
         first = recent[0]
         times = [float(one.at - first.at) for one in recent]
         offsets = [float(one.ahead + one.apart - first.ahead - first.apart) for one in recent]
-        mean = sum(w * t for w, t in zip(weights, times, strict=True)) / total
-        moment = sum(w * (t - mean) * o for w, t, o in zip(weights, times, offsets, strict=True))
-        return moment / sum(w * (t - mean) ** 2 for w, t in zip(weights, times, strict=True))
-
-
-def _grown(one: Exchange) -> float:
-    """The bound of an exchange at any time, less a number that all exchanges have in common."""
-    return one.bound - TOLERANCE * one.at
+        variance, covariance = np.cov(times, offsets, ddof=0, aweights=weights)[0]
+        return float(covariance / variance)
 
 
 class Section(NamedTuple):
@@ -316,8 +317,7 @@ class Clocks:
         self._id = bytes.fromhex(link[:16])
         self._max_offset = max_offset
         # Filled by any thread.
-        self._arrived: dict[str, tuple[bytes, int]] = {}
-        self._bases: dict[str, int] = {}
+        self._arrived: dict[str, tuple[Section, int]] = {}
         self._peers: dict[str, ClockFilter] = {}
         self._echoes: dict[str, tuple[int, int]] = {}
         self._origins: dict[bytes, _Origin] = {}
@@ -327,10 +327,11 @@ class Clocks:
 
     def arrive(self, link: str, section: bytes) -> bool:
         """Take the end of a sign, in any thread; returns whether it tells no step of the peer's clock."""
+        arrived, told = self.own.steady(), read_section(section, self._id)
         if link in self._arrived or len(self._arrived) < _MOST_ARRIVED:
-            self._arrived[link] = section, self.own.steady()
-        base: int = _END.unpack_from(section, len(section) - _END.size)[1]
-        return abs(base - self._bases.get(link, base)) <= STEP
+            self._arrived[link] = told, arrived
+        peer = self._peers.get(link)
+        return peer is None or not peer.steps_to(told.base)
 
     def joined(self, link: str) -> None:
         """Begin to measure a peer; one whose id is not made of hexadecimal digits cannot be answered."""
@@ -340,8 +341,9 @@ class Clocks:
 
     def left(self, link: str) -> None:
         """Forget a peer."""
-        for known in (self._peers, self._echoes, self._bases, self._arrived):
-            cast("dict[str, object]", known).pop(link, None)
+        self._peers.pop(link, None)
+        self._echoes.pop(link, None)
+        self._arrived.pop(link, None)
 
     def settle(self) -> None:
         """Read all that has arrived."""
@@ -352,11 +354,10 @@ class Clocks:
                 peer.was_set()
         self._own_base = own
         while self._arrived:
-            link, (section, arrived) = self._arrived.popitem()
+            link, ((steady, base, echo), arrived) = self._arrived.popitem()
             if link not in self._peers:
                 continue
             peer = self._peers[link]
-            steady, base, echo = read_section(section, self._id)
             self._echoes[link] = steady, arrived
             self._rebase(link, peer, base)
             if echo is not None:
@@ -364,12 +365,10 @@ class Clocks:
                 peer.note(echo[0], echo[1], steady, arrived, apart)
                 self._news.add(link)
 
-    def is_measured(self, link: str) -> bool | None:
-        """Whether the clock of a peer can be placed now; None if it never can, because it does not run by itself."""
+    def is_measured(self, link: str) -> bool:
+        """Whether it is known how far the steady clock of a peer is ahead."""
         peer = self._peers.get(link)
-        if peer is None or peer.base is None:
-            return None if link in self._bases else False
-        return peer.ahead(self.own.steady()) is not None
+        return peer is not None and peer.ahead(self.own.steady()) is not None
 
     def section(self, *, answers: bool) -> bytes:
         """The end of a sign that goes out now; one to a single peer answers no others."""
@@ -469,18 +468,15 @@ class Clocks:
     def statistics(self, peers: Iterable[tuple[str, Iterable[str]]]) -> tuple[PeerClock, ...]:
         """The clocks of some peers, each given by its id and its authorities."""
         self.settle()
+        own, now = self.own.base(), self.own.steady()
         return tuple(
-            self._statistics(link, self._peers[link], tuple(sorted(authorities)))
+            self._peers[link].statistics(link, tuple(sorted(authorities)), own, now)
             for link, authorities in peers
             if link in self._peers
         )
 
-    def _statistics(self, link: str, peer: ClockFilter, authorities: tuple[str, ...]) -> PeerClock:
-        return peer.statistics(link, authorities, self.own.base(), self.own.steady())
-
     def _rebase(self, link: str, peer: ClockFilter, base: int | None) -> None:
-        if base is not None and abs(base - self._bases.get(link, base)) > STEP:
+        if peer.steps_to(base):
             peer.was_set()
             self._news.add(link)
         peer.base = base
-        self._bases[link] = _NO_BASE if base is None else base

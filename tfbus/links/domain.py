@@ -19,18 +19,21 @@ from tfbus.links.message import (
     END_OF_STAMPS,
     FIRST_STAMP,
     LONGEST_WAY,
+    ChangesQuestion,
     Heard,
     Kind,
     Outgoing,
+    PastQuestion,
     Text,
     Way,
     kind_of,
-    read_fields,
     read_message,
+    read_question,
     sendable,
     split_clocks,
+    write_body,
     write_message,
-    write_text,
+    write_question,
 )
 from tfbus.links.relay import Peer
 from tfbus.links.replica import (
@@ -205,9 +208,9 @@ class DomainEnd(Endpoint):
         """Ask the question that is due, unless it is put off."""
         question = self._agreement.question(now, self.host.is_behind() or self._wire.is_behind())
         if question is not None:
-            frames = sorted(self.frames) if self.frames is not None and self._filters else None
-            text = write_text(Kind.QUESTION, {"since": question.since, "frames": frames})
-            if not self._wire.send(question.peer, text):
+            frames = tuple(sorted(self.frames)) if self.frames is not None and self._filters else None
+            body = write_question(ChangesQuestion(question.since, frames))
+            if not self._wire.send(question.peer, write_body(Kind.QUESTION, body)):
                 self._agreement.unanswered(question.peer, now)
 
     def split(self, item: Received) -> Iterator[Any]:
@@ -443,11 +446,10 @@ class DomainEnd(Endpoint):
         """Read what signs have told of clocks; once that of a peer is known, correct what it told before."""
         self.clocks.settle()
         self._tell_offsets()
-        is_measured = self.clocks.is_measured(peer.id)
-        if peer.is_placed or is_measured is False:
+        if peer.is_placed or not self.clocks.is_measured(peer.id):
             return
         peer.is_placed = True
-        for known in list(self.relay.replica.entries.values()) if is_measured else ():
+        for known in list(self.relay.replica.entries.values()):
             source, sample = known.source, known.sample
             if source.peer is not peer or source.clock is not None or not isinstance(sample, FromLink):
                 continue
@@ -631,21 +633,16 @@ class DomainEnd(Endpoint):
 
     # Answers
 
-    def _answer(self, sender: str, question: bytes) -> None:
-        fields = read_fields(question)
-        since, names = fields.get("since"), fields.get("frames")
-        if type(since) is not int or not 0 <= since < 2**64:
-            raise MalformedMessageError("text", f"a question since {since!r}"[:100])
-        if not isinstance(names, list | None) or not all(isinstance(name, str) for name in names or ()):
-            raise MalformedMessageError("text", "a filter without names")
-        frames = None if names is None else frozenset(names)
+    def _answer(self, sender: str, body: bytes) -> None:
+        question = read_question(ChangesQuestion, body)
+        frames = None if question.frames is None else frozenset(question.frames)
         if frames is not None:
             if self.frames is None or frames <= self.frames:
                 self._agreement.filters(sender, frames)
             self._channels.serve(frames, self._now())
         limit = CHUNK
         while limit:
-            entries, claim = self.own.changes(since, self._now(), frames, limit)
+            entries, claim = self.own.changes(question.since, self._now(), frames, limit)
             out = Outgoing(Kind.ANSWER, self._bus, 0, claim, None, self._reach())
             try:
                 message = write_message(out, entries)
@@ -655,12 +652,9 @@ class DomainEnd(Endpoint):
                 self._wire.send(sender, message)
                 return
 
-    def _tell_past(self, sender: str, question: bytes) -> None:
-        fields = read_fields(question)
-        seconds, after = fields.get("seconds"), fields.get("after")
-        if isinstance(seconds, bool) or not isinstance(seconds, (int, float)) or not isinstance(after, str):
-            raise MalformedMessageError("text", "a question for the past without a time and a name")
-        entries, final = chunk_of_past(self.bus, self.own.brought(self), seconds, after)
+    def _tell_past(self, sender: str, body: bytes) -> None:
+        question = read_question(PastQuestion, body)
+        entries, final = chunk_of_past(self.bus, self.own.brought(self), question.seconds, question.after)
         out = Outgoing(Kind.PAST, self._bus, 0, Claim(0, 0, 0, final))
         self._wire.send(sender, write_message(out, entries))
 

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from math import inf
 
 from tfbus.bus.bus import Bus
+from tfbus.bus.subscribers import SeenKeys
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.message import Heard, Kind, write_text
+from tfbus.links.message import Heard, Kind, PastQuestion, write_body, write_question
 from tfbus.links.replica import Known, OutgoingBatch, ReceivedBatch
 from tfbus.stamps import from_seconds
 from tfbus.tree.history import samples_of
@@ -103,16 +104,13 @@ class HistoryAsker:
         self._seconds = seconds
         self._send = send
         self._now = now
-        self._asked: dict[str, None] = {}
+        self._asked = SeenKeys(MOST_REMEMBERED)
         self.open: dict[str, _Open] = {}
         self._size = 0
 
     def joined(self, peer: str) -> None:
         """Ask a peer, if it was not asked before."""
-        if self._seconds and peer not in self._asked:
-            self._asked[peer] = None
-            if len(self._asked) > MOST_REMEMBERED:
-                del self._asked[next(iter(self._asked))]
+        if self._seconds and self._asked.add(peer):
             self._ask(peer, "")
 
     def holds(self, peer: str, message: Heard) -> bool:
@@ -139,7 +137,7 @@ class HistoryAsker:
     def _ask(self, peer: str, after: str) -> None:
         waiting = self.open.setdefault(peer, _Open())
         waiting.after, waiting.due = after, self._now() + PATIENCE
-        self._send(peer, write_text(Kind.PAST_QUESTION, {"seconds": self._seconds, "after": after}))
+        self._send(peer, write_body(Kind.PAST_QUESTION, write_question(PastQuestion(self._seconds, after))))
 
     def end(self, peer: str) -> list[Heard]:
         """Stop waiting for the answer of a peer; returns its messages that were held back."""

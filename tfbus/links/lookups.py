@@ -143,13 +143,13 @@ class RemoteLookups:
             pending.answer = data[_NUMBER:]
             pending.done.set()
 
-    def answer(self, asker: str, number: int, answer: bytes) -> None:
-        """Send an answer to a link."""
-        self._send(asker, write_body(Kind.LOOKUP_ANSWER, number.to_bytes(_NUMBER, "little") + answer))
+    def put(self, kind: Kind, link: str, number: int, body: bytes) -> bool:
+        """Send a question or an answer to a link; returns False if it is known not to arrive."""
+        return self._send(link, write_body(kind, number.to_bytes(_NUMBER, "little") + body))
 
     def refuse(self, asker: str, number: int, reason: str, detail: str) -> None:
         """Send an answer that refuses a question."""
-        self.answer(asker, number, write_answer(self._error(None, reason, detail)))
+        self.put(Kind.LOOKUP_ANSWER, asker, number, write_answer(self._error(None, reason, detail)))
 
     # Going out
 
@@ -168,17 +168,15 @@ class RemoteLookups:
                 if error.reason != "silent" or silences > _MOST_SILENCES or anyio.current_time() >= until:
                     raise
             except LookupTimeoutError as error:
-                missing = error.__cause__
-                if anyio.current_time() >= until or left <= LONGEST_WAIT:
-                    if not isinstance(missing, TransformLookupError):
-                        missing = error
+                if left <= LONGEST_WAIT:
+                    missing = error.__cause__ if isinstance(error.__cause__, TransformLookupError) else error
                     target, source = question.target, question.source
                     raise LookupTimeoutError(target=target, source=source, timeout=limit, missing=missing) from missing
 
     async def _find_server(self, robot: str | None, until: float) -> str:
         server = self._server_of(robot)
         if server is None:
-            with anyio.move_on_after(min(PATIENCE, max(until - anyio.current_time(), 0.0))):
+            with anyio.CancelScope(deadline=min(until, anyio.current_time() + PATIENCE)):
                 while self._is_open and (server := self._server_of(robot)) is None:
                     await self._changed.wait()
         if not self._is_open:
@@ -198,7 +196,7 @@ class RemoteLookups:
         answered = False
         try:
             question.timeout = timeout
-            if not self._put(server, number, write_question(question)):
+            if not self.put(Kind.LOOKUP, server, number, write_question(question)):
                 raise self._error(robot, "silent", "the question could not be sent")
             with anyio.move_on_after(timeout + PATIENCE):
                 await pending.done.wait()
@@ -206,18 +204,12 @@ class RemoteLookups:
         finally:
             del self._pending[number]
             if not answered:
-                self._put(server, number, b"")
+                self.put(Kind.LOOKUP, server, number, b"")
         if not answered:
             raise self._error(robot, "silent", f"it has not answered within {timeout + PATIENCE:g} s")
         if pending.answer is None:
             raise self._error(robot, "lost", "it has gone" if self._is_open else "this link has ended")
-        answer = read_answer(pending.answer, self._domain, robot, question)
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
-    def _put(self, server: str, number: int, body: bytes) -> bool:
-        return self._send(server, write_body(Kind.LOOKUP, number.to_bytes(_NUMBER, "little") + body))
+        return read_answer(pending.answer, self._domain, robot, question)
 
     def _error(self, robot: str | None, reason: str, detail: str) -> RemoteLookupError:
         return RemoteLookupError(domain=self._domain, robot=robot, reason=reason, detail=detail)
@@ -286,7 +278,7 @@ class BufferServer(AsyncOnly):
         self._counts: Counter[str] = Counter()
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._lookups: RemoteLookups
-        self._tasks: anyio.abc.TaskGroup | None = None
+        self._tasks: anyio.abc.TaskGroup
         self._warn_unless_entered()
 
     def statistics(self) -> BufferServerStatistics:
@@ -325,26 +317,36 @@ class BufferServer(AsyncOnly):
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        assert self._tasks is not None
-        tasks, self._tasks = self._tasks, None
         self._link.serve(None)
-        tasks.cancel_scope.cancel()
-        await close_task_group(tasks)
+        self._tasks.cancel_scope.cancel()
+        await close_task_group(self._tasks)
 
     def take(self, asker: str, number: int, data: bytes) -> None:
         """Answer a question that can be answered now, else let it wait. Called by the link."""
         key = asker, number
         try:
-            question = read_question(data)
-        except ValueError as error:
-            self._refuse(*key, "malformed", f"the question cannot be read: {error}")
+            question = read_question(RemoteQuestion, data)
+        except MalformedMessageError as error:
+            self._refuse(key, "malformed", f"the question cannot be read: {error.detail}")
             return
         if not self._admit():
-            self._refuse(*key, "busy", f"more than {self._rate:g} lookups come in a second")
-        elif key in self._waiting:
-            self._refuse(*key, "malformed", "the number of the question was used before")
-        else:
-            self._take(key, question)
+            self._refuse(key, "busy", f"more than {self._rate:g} lookups come in a second")
+            return
+        if key in self._waiting:
+            self._refuse(key, "malformed", "the number of the question was used before")
+            return
+        try:
+            answer: TransformStamped | Exception = self._buffer.lookup_nowait(**_arguments(question))
+        except MAY_COME:
+            if len(self._waiting) >= self._capacity:
+                self._refuse(key, "busy", f"{self._capacity} lookups wait there, and no more may")
+                return
+            self._waiting[key] = scope = anyio.CancelScope()
+            self._tasks.start_soon(self._wait, key, question, scope)
+            return
+        except Exception as error:  # noqa: BLE001 - it is told to the asker
+            answer = error
+        self._answer(key, answer)
 
     def lose(self, asker: str) -> None:
         """Cancel the questions of a link that has gone. Called by the link."""
@@ -357,22 +359,6 @@ class BufferServer(AsyncOnly):
         if scope is not None:
             self._counts["cancelled"] += 1
             scope.cancel()
-
-    def _take(self, key: tuple[str, int], question: RemoteQuestion) -> None:
-        try:
-            answer: TransformStamped | Exception = self._buffer.lookup_nowait(**_arguments(question))
-        except MAY_COME:
-            if self._tasks is None:
-                return
-            if len(self._waiting) >= self._capacity:
-                self._refuse(*key, "busy", f"{self._capacity} lookups wait there, and no more may")
-                return
-            self._waiting[key] = scope = anyio.CancelScope()
-            self._tasks.start_soon(self._wait, key, question, scope)
-            return
-        except Exception as error:  # noqa: BLE001 - it is told to the asker
-            answer = error
-        self._answer(key, answer)
 
     async def _wait(self, key: tuple[str, int], question: RemoteQuestion, scope: anyio.CancelScope) -> None:
         answer: TransformStamped | Exception | None = None
@@ -399,10 +385,10 @@ class BufferServer(AsyncOnly):
             message = write_answer(answer)
         except Exception as error:  # noqa: BLE001 - the next question is answered
             self._log.warning(type(error).__name__, "a lookup of another process failed", exc_info=error)
-            self._refuse(*key, "internal", f"the lookup failed there with {type(error).__name__}")
+            self._refuse(key, "internal", f"the lookup failed there with {type(error).__name__}")
         else:
             self._counts["failed" if isinstance(answer, Exception) else "answered"] += 1
-            self._lookups.answer(*key, message)
+            self._lookups.put(Kind.LOOKUP_ANSWER, *key, message)
 
     def _admit(self) -> bool:
         now = monotonic()
@@ -413,9 +399,9 @@ class BufferServer(AsyncOnly):
         self._allowance -= 1
         return True
 
-    def _refuse(self, asker: str, number: int, reason: str, detail: str) -> None:
+    def _refuse(self, key: tuple[str, int], reason: str, detail: str) -> None:
         self._counts[reason] += 1
-        self._lookups.refuse(asker, number, reason, detail)
+        self._lookups.refuse(*key, reason, detail)
 
 
 def _arguments(question: RemoteQuestion) -> dict[str, Any]:

@@ -18,14 +18,14 @@ sender holds. The samples themselves are a TFMessage behind that. Little endian:
     clocks       the section of `tfbus.links.clocks`, if the flags say so
 
 The kinds are those of `tfbus.links.replica`, and those of the past and of lookups. Questions are JSON behind version
-and kind. A question of a lookup and its answer have a number of 8 bytes before the JSON, by which an answer finds its
-question; a number alone cancels the question. Reading a message costs time in proportion to its bytes; handling an
-entry may cost more, so both have a limit.
+and kind: the fields of `ChangesQuestion`, `PastQuestion` or `RemoteQuestion`. A question of a lookup and its answer
+have a number of 8 bytes before the JSON, by which an answer finds its question; a number alone cancels the question.
+Reading a message costs time in proportion to its bytes; handling an entry may cost more, so both have a limit.
 
 An error of a lookup travels with its facts, see `tfbus.errors.TransformError.to_dict`. `read_question` and
 `read_answer` are the door for the data of strangers. They check what Python would trip over later: integers that are
 no stamps, values inside values, names of any length, errors that no lookup raises, and answers to another question.
-They raise nothing but a `ValueError`.
+For bytes with any of these, they raise one kind of error each.
 """
 
 import enum
@@ -34,7 +34,7 @@ import struct
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from sys import intern
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -62,7 +62,7 @@ from tfbus.links.replica import (
 )
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
-from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode, decode_in_parts, encode, refusal
+from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode_in_parts, encode, refusal
 from tfbus.uncertainty.answers import UncertainTransform
 
 VERSION = 6
@@ -71,7 +71,7 @@ MAX_BYTES = 2**22
 MAX_HEAD = 2**20
 """The largest part of a message before its samples."""
 MAX_TEXT = 2**17
-"""The largest message of JSON."""
+"""The most bytes of JSON in one message."""
 MAX_DEPTH = 16
 """The deepest nesting of values; an error with its cause takes two levels."""
 MAX_ENTRIES = 10_000
@@ -79,18 +79,15 @@ MAX_SAMPLES = 10_000
 """The largest batch that is sent or accepted: a bus publishes it in one turn of the loop, all or nothing."""
 LONGEST_WAY = 8
 """The most buses on the way to a bus."""
-_LARGE = 2**15
-"""Bytes; a message beyond is read in parts."""
 _PART = 200
 """The samples or entries of a large message that are handled before other tasks may have their turn."""
 _PART_OF_HEAD = 1_000
 _BELIEFS_AT_ONCE = 50
 _LONGEST_AUTHORITY = 65_535
 FIRST_STAMP, END_OF_STAMPS = -(2**31) * SECOND, 2**31 * SECOND
-_HELD: set[tuple[str, str, str]] = set()
-"""Parents, children and authorities that a message can hold, of the last calls of `can_hold`."""
-_MOST_HELD = 2_000
 _MOST_DIGITS = 20
+_BEFORE_TEXT = 10
+"""The bytes before the JSON of a lookup: version, kind and number."""
 _SHOWN = 200
 
 _ARGUMENT_ERRORS: dict[str, type[Exception]] = {"TypeError": TypeError, "ValueError": ValueError}
@@ -109,6 +106,7 @@ _FINAL, _PARTIAL, _HAS_TIME, _SERVES, _HAS_CLOCKS = 1, 2, 4, 8, 16
 _NO_CLOCK = -(2**63)
 _BUS = 16
 
+QuestionT = TypeVar("QuestionT", bound=PlainData)
 NOTHING = Claim(0, 0, 0)
 Way = tuple[bytes, tuple[bytes, ...]]
 """A bus that is reached, and the buses on the way there."""
@@ -218,11 +216,6 @@ def write_message(out: Outgoing, entries: Sequence[Entry] = ()) -> bytes:
     return message
 
 
-def write_text(kind: Kind, fields: dict[str, Any]) -> bytes:
-    """The bytes of a message of JSON."""
-    return write_body(kind, json.dumps(fields).encode())
-
-
 def write_body(kind: Kind, body: bytes) -> bytes:
     """The bytes of a message with this body."""
     return bytes((VERSION, kind)) + body
@@ -251,17 +244,12 @@ def sendable(entry: Entry, refuse: Callable[[str, Exception], object]) -> Entry 
 
 def can_hold(sample: TransformStamped) -> bool:
     """Whether a message can hold a sample."""
-    # The same names come again with each sample of a frame.
-    names = sample.parent, sample.child, sample.authority
-    if names in _HELD:
-        return FIRST_STAMP <= sample.stamp < END_OF_STAMPS
-    if reason_not_to_send(sample) is not None:
-        return False
-    if len(_HELD) >= _MOST_HELD:
-        _HELD.clear()
-    if len(sample.authority) < _MOST_HELD:
-        _HELD.add(names)
-    return True
+    parent, child, stamp, _, authority, _ = sample._fields
+    names = parent + child + authority
+    # The usual case, in which a letter is a byte.
+    if len(names) <= MAX_NAME and names.isascii():
+        return FIRST_STAMP <= stamp < END_OF_STAMPS
+    return reason_not_to_send(sample) is None
 
 
 def reason_not_to_send(sample: TransformStamped) -> InvalidTransformError | None:
@@ -358,7 +346,7 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
     if kind is None:
         raise MalformedMessageError("version", f"expected a message of version {VERSION}, got {data[:2]!r}")
     if kind in TEXTS:
-        if len(data) > MAX_TEXT:
+        if len(data) > MAX_TEXT + _BEFORE_TEXT:
             raise MalformedMessageError("oversized", f"a text of {len(data)} bytes, more than {MAX_TEXT}")
         yield Text(kind, data[2:])
         return
@@ -373,16 +361,11 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
         raise MalformedMessageError("head", "a name in a message is no UTF-8") from None
     samples: list[FromLink | None] = []
     if tags or end < len(data):
-        payload = data[end:]
-        if len(data) > _LARGE:
-            yield None
-            for decoded in decode_in_parts(payload, _PART, ReceivedTransform, tags=tags):
-                samples += decoded.samples
-                heard.errors += decoded.errors
+        for decoded in decode_in_parts(data[end:], _PART, ReceivedTransform, tags=tags):
+            if samples:
                 yield None
-        else:
-            decoded = decode(payload, tags, ReceivedTransform)
-            samples, heard.errors = [*decoded.samples], decoded.errors
+            samples += decoded.samples
+            heard.errors += decoded.errors
     for place, belief in beliefs.items():
         sample = samples[place]
         samples[place] = None if sample is None else _with_belief(sample, belief)
@@ -398,20 +381,6 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
         size += 1 + count
         heard.entries.append(entry)
     yield heard
-
-
-def read_fields(data: bytes) -> dict[str, Any]:
-    """The JSON object in the body of a text.
-
-    Raises
-    ------
-    MalformedMessageError
-        If there is none.
-    """
-    try:
-        return _read(data)
-    except ValueError as error:
-        raise MalformedMessageError("text", str(error)) from None
 
 
 def _read_head(
@@ -509,7 +478,35 @@ def _with_belief(sample: FromLink, belief: Belief) -> FromLink:
     return found
 
 
-# Lookups
+# Questions
+
+
+@dataclass(slots=True)
+class ChangesQuestion(PlainData):
+    """A question for the changes of a copy.
+
+    Attributes
+    ----------
+    since : int
+        The asker knows the changes up to this sequence.
+    frames : tuple of str or None
+        The frames that the asker wants; None for all.
+    """
+
+    since: int
+    frames: tuple[str, ...] | None
+
+    def __post_init__(self) -> None:
+        if self.since < 0:
+            raise ValueError(f"a sequence is not negative, got {self.since}")
+
+
+@dataclass(slots=True)
+class PastQuestion(PlainData):
+    """A question for the samples of the last `seconds`, of the frames whose names come after `after`."""
+
+    seconds: float
+    after: str
 
 
 @dataclass(slots=True)
@@ -535,27 +532,30 @@ class RemoteQuestion(PlainData):
     covariance: bool = False
 
 
-def write_question(question: RemoteQuestion) -> bytes:
+def write_question(question: PlainData) -> bytes:
     """The bytes of a question."""
     return json.dumps(question.to_dict()).encode()
 
 
-def read_question(data: bytes) -> RemoteQuestion:
+def read_question(kind: type[QuestionT], data: bytes) -> QuestionT:
     """The question in some bytes.
 
     Raises
     ------
-    ValueError
-        If they are no question, or it has an integer of more than 64 bits or a name of more than `MAX_NAME` bytes.
+    MalformedMessageError
+        If they are no such question, or it has an integer of more than 64 bits or a name of more than `MAX_NAME` bytes.
     """
-    fields = _read(data)
-    for name, value in fields.items():
-        if isinstance(value, str) and len(value.encode()) > MAX_NAME:
-            raise ValueError(f"its field {_shown(name)} has more than {MAX_NAME} bytes")
     try:
-        return RemoteQuestion.from_dict(fields)
+        fields = _read(data)
+        for name, value in fields.items():
+            if isinstance(value, str) and len(value.encode()) > MAX_NAME:
+                raise ValueError(f"its field {_shown(name)} has more than {MAX_NAME} bytes")
+        return kind.from_dict(fields)
     except ValueError as error:
-        raise ValueError(str(error)[:_SHOWN]) from None
+        raise MalformedMessageError("text", str(error)[:_SHOWN]) from None
+
+
+# Answers of lookups
 
 
 def write_answer(answer: TransformStamped | Exception) -> bytes:
@@ -572,20 +572,25 @@ def write_answer(answer: TransformStamped | Exception) -> bytes:
 
 def read_answer(
     data: bytes, domain: str, robot: str | None, question: RemoteQuestion | None = None
-) -> TransformStamped | Exception:
-    """The answer in some bytes, or the error to raise; a `RemoteLookupError` if the bytes are neither.
+) -> TransformStamped:
+    """The answer in some bytes; with a question, an answer about other frames or another stamp is none.
 
-    With a question, an answer about other frames or another stamp is none.
+    Raises
+    ------
+    TransformError, TypeError, ValueError
+        The error in the bytes, if the lookup has failed.
+    RemoteLookupError
+        If the bytes are neither an answer nor such an error.
     """
     try:
         answer = _answer_of(_read(data))
         if question is not None and isinstance(answer, TransformStamped):
             _check_answers(answer, question)
-            if question.covariance and not isinstance(answer, UncertainTransform):
-                raise ValueError("it has no covariance")
     except Exception as error:  # noqa: BLE001 - the asker gets one kind of error for all bad answers
         detail = f"not an answer: {str(error)[:_SHOWN]}"
-        return RemoteLookupError(domain=domain, robot=robot, reason="malformed", detail=detail)
+        raise RemoteLookupError(domain=domain, robot=robot, reason="malformed", detail=detail) from None
+    if isinstance(answer, Exception):
+        raise answer
     return answer
 
 
@@ -607,12 +612,12 @@ def _check_answers(answer: TransformStamped, question: RemoteQuestion) -> None:
         raise ValueError(f"it is about {_shown(answer.parent)} and {_shown(answer.child)}")
     if not (answer.static or isinstance(question.at, Latest) or answer.stamp == question.at):
         raise ValueError(f"it is of the stamp {answer.stamp}, not of {question.at}")
+    if question.covariance and not isinstance(answer, UncertainTransform):
+        raise ValueError("it has no covariance")
 
 
 def _read(data: bytes) -> dict[str, Any]:
     """The JSON object in some bytes; raises `ValueError` if they are none, or beyond a bound."""
-    if len(data) > MAX_TEXT:
-        raise ValueError(f"{len(data)} bytes, more than {MAX_TEXT}")
     try:
         fields = _decoder.decode(data.decode())
     except RecursionError:
