@@ -31,8 +31,8 @@ from support.wires import HEARS_ALL, Ear, met, running
 
 from tfbus.links.local import local_wire
 from tfbus.links.local.connection import LONGEST_HELLO
-from tfbus.links.local.local_wire import MOST_STRANGERS, MOST_UNFINISHED, LocalWire
-from tfbus.links.seams import MAX_MESSAGE, Joined, Left
+from tfbus.links.local.local_wire import MOST_HEARINGS, MOST_STRANGERS, MOST_UNFINISHED, LocalWire
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left
 
 pytestmark = pytest.mark.anyio
 
@@ -88,6 +88,15 @@ async def test_a_link_that_connects_twice_at_once_is_met_once(directory: str) ->
             assert await first.end() == []
             await second.say(b"still here")
             await until(lambda: ear.said(first.link) == [b"still here"])
+
+
+async def test_the_longest_hello_is_heard_and_a_longer_one_refused_on_opening(directory: str) -> None:
+    hears = [Hearing(f"{number:0200}", "c" * 32) for number in range(MOST_HEARINGS)]
+    one, two = (LocalWire(DOMAIN, f"{MOST_HEARINGS - 1:0200}", directory=directory) for _ in range(2))
+    async with running(one, hears) as ear_one, running(two, hears) as ear_two:
+        await met(ear_one, ear_two)
+    with pytest.raises(OSError, match="1000 names of robots at most, and 1001 are given"):
+        await LocalWire(DOMAIN, directory=directory).open([*hears, *HEARS_ALL], ear_one.receive, print)
 
 
 @pytest.mark.parametrize("stops", ["older", "younger"])

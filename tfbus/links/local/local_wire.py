@@ -29,8 +29,8 @@ is met at the next look. A link looks often at first, and then every two seconds
 two connections:
 
 * Only the younger link says hello first. It has at most one connection to each older link, and waits on it for the
-  answer as long as it lasts. It never ends it because the answer is late: the older link may be stopped, and then go on
-  and read the hello. So the side that listens may take the first hello as the other's last word, and is met.
+  answer as long as the connection lasts, however late the answer is: the older link may be stopped, and go on later and
+  read the hello. So the side that listens is met when it has read the hello: the other has not gone meanwhile.
 * The older link chooses. It may end a connection whose hello it has not read, and the younger one then connects again.
   An id in use is not taken over: another connection of that id is refused while the first one is there.
 
@@ -49,8 +49,8 @@ Each connection queues at most 8 MiB of published messages, and then drops the o
 messages, which go first; a frame whose writing has begun is finished before. A message is at most `MAX_MESSAGE` long; a
 longer one ends its connection. All unfinished messages have at most 64 MiB together; beyond that, the connection whose
 message has not grown for the longest time is closed. There are at most 1,000 connections. Of the incoming connections
-that are not met, the newest 64 are kept, for 10 s. One turn of the event loop reads for about a millisecond, and one
-read more.
+that are not met, the newest 64 are kept, for 10 s. A hello has at most 256 KiB, which is room for 1,000 names of robots
+that its sender hears. One turn of the event loop reads for about a millisecond, and one read more.
 """
 
 import os
@@ -76,6 +76,8 @@ from tfbus.tf_message import MalformedMessageError
 MOST_CONNECTIONS: Final = 1_000
 MOST_STRANGERS: Final = 64
 """The most incoming connections that are not met yet."""
+MOST_HEARINGS: Final = 1_000
+"""The most names of robots that a link hears, so that its hello is not too long."""
 MOST_UNFINISHED: Final = 2**26
 """Bytes of all unfinished messages together."""
 PATIENCE: Final = 10.0
@@ -125,6 +127,8 @@ class LocalWire(Wire):
         self._ready: deque[tuple[SelectorKey, int]] = deque()
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
+        if len(hears) > MOST_HEARINGS:
+            raise OSError(f"a link hears {MOST_HEARINGS} names of robots at most, and {len(hears)} are given")
         self._hears, self._receive, self._warn = tuple(hears), receive, warn
         self._poll = Poll()
         _open_wires.add(self)
