@@ -51,18 +51,15 @@ class RawPeer:
         message, self._read = self._read[4 : 4 + length], self._read[4 + length :]
         return message
 
-    def hello(self, robot: str = "") -> bytes:
+    def hello(self, robot: str = "", hears: str = "* all") -> bytes:
         """A hello of this peer."""
-        return b"tfbus local 2\n" + self.link.encode() + self._key[:16] + robot.encode()
+        return b"tfbus local 3\n" + self.link.encode() + self._key[:16] + f"{robot}\n{hears}".encode()
 
-    async def meet(self, robot: str = "", channel: str = "all", *, link: str = "") -> str:
-        """Say hello and welcome; returns the channel that the other link hears."""
+    async def meet(self, robot: str = "", *, link: str = "") -> None:
+        """Say hello, and hear the other's."""
         self.link = link or self.link
         await self.say(self.hello(robot))
         assert (await self.hear())[46:62] == self._key[16:]
-        welcome = await self.hear()
-        await self.say(channel.encode())
-        return welcome.decode()
 
     async def end(self) -> list[bytes]:
         """All frames that still come until the other side ends the connection."""

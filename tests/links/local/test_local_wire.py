@@ -30,8 +30,9 @@ from support.processes import OPEN_FILES, Program, on_one_loop, until
 from support.wires import HEARS_ALL, Ear, met, running
 
 from tfbus.links.local import local_wire
-from tfbus.links.local.local_wire import MOST_STRANGERS, MOST_UNFINISHED, LocalWire
-from tfbus.links.seams import MAX_MESSAGE, Left
+from tfbus.links.local.connection import LONGEST_HELLO
+from tfbus.links.local.local_wire import MOST_HEARINGS, MOST_STRANGERS, MOST_UNFINISHED, LocalWire
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left
 
 pytestmark = pytest.mark.anyio
 
@@ -81,14 +82,48 @@ async def test_a_link_that_connects_twice_at_once_is_met_once(directory: str) ->
     async with running(wire) as ear:
         first, second = [await RawPeer.connect(files_in(directory)[0]) for _ in range(2)]
         async with first.stream, second.stream:
-            await first.say(first.hello())
-            assert await first.hear()
             await second.meet(link=first.link)
             await ear.joined(first.link)
-            await first.say(b"all")
-            assert len(await first.end()) == 1
+            await first.say(first.hello())
+            assert await first.end() == []
             await second.say(b"still here")
             await until(lambda: ear.said(first.link) == [b"still here"])
+
+
+async def test_the_longest_hello_is_heard_and_a_longer_one_refused_on_opening(directory: str) -> None:
+    hears = [Hearing(f"{number:0200}", "c" * 32) for number in range(MOST_HEARINGS)]
+    one, two = (LocalWire(DOMAIN, f"{MOST_HEARINGS - 1:0200}", directory=directory) for _ in range(2))
+    async with running(one, hears) as ear_one, running(two, hears) as ear_two:
+        await met(ear_one, ear_two)
+    with pytest.raises(OSError, match="1000 names of robots at most, and 1001 are given"):
+        await LocalWire(DOMAIN, directory=directory).open([*hears, *HEARS_ALL], ear_one.receive, print)
+
+
+@pytest.mark.parametrize("stops", ["older", "younger"])
+async def test_a_link_that_is_stopped_while_it_meets_another_is_not_lost(
+    directory: str, loopback: bool, stops: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(local_wire, "PATIENCE", 0.05)
+    ears = older, younger = [Ear(LocalWire(DOMAIN, directory=directory, loopback=loopback)) for _ in range(2)]
+    first, second = (younger, older) if stops == "older" else (older, younger)
+    try:
+        for ear in ears:
+            await ear.wire.open(HEARS_ALL, ear.receive, ear.warnings.append)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(first.wire.run)
+            # It has no reason to lose patience with the other, which goes on later.
+            await anyio.sleep(1.0)
+            tasks.start_soon(second.wire.run)
+            await met(*ears)
+            for ear, other in ((older, younger), (younger, older)):
+                assert ear.wire.send(other.id, b"still here")
+                await until(lambda ear=ear, other=other: other.said(ear.id) == [b"still here"])  # type: ignore[misc]
+            tasks.cancel_scope.cancel()
+        for ear, other in ((older, younger), (younger, older)):
+            assert ear.of(other) == [Joined(), b"still here"]
+    finally:
+        for ear in ears:
+            await ear.wire.close()
 
 
 # Frames
@@ -315,24 +350,31 @@ async def test_a_hello_without_end_is_cut_off(directory: str) -> None:
     async with running(wire):
         stranger = await RawPeer.connect(files_in(directory)[0])
         async with stranger.stream:
-            await stranger.stream.send(struct.pack("<I", 2**14 + 1))
+            await stranger.stream.send(struct.pack("<I", LONGEST_HELLO + 1))
             assert await stranger.end() == []
 
 
 @pytest.mark.parametrize(
-    ("right", "wrong", "channel"),
-    [(b"local 2", b"local 3", b""), (b"\n", b"\n?", b""), (b"robot", b"ro/bot", b""), (b"", b"", b"a channel")],
-    ids=["protocol", "id", "name", "channel"],
+    ("right", "wrong"),
+    [
+        (b"local 3", b"local 2"),
+        (b"\n", b"\n?"),
+        (b"robot", b"ro/bot"),
+        (b" all", b" a/l"),
+        (b" all", b""),
+        (b"*", b"a b"),
+    ],
+    ids=["protocol", "id", "name", "channel", "no channel", "pattern"],
 )
 async def test_a_program_that_does_not_speak_the_protocol_is_not_heard(
-    directory: str, right: bytes, wrong: bytes, channel: bytes
+    directory: str, right: bytes, wrong: bytes
 ) -> None:
     async with running(LocalWire(DOMAIN, directory=directory)) as ear:
         stranger = await RawPeer.connect(files_in(directory)[0])
         async with stranger.stream:
-            await stranger.say(stranger.hello("robot").replace(right, wrong, 1), channel)
+            await stranger.say(stranger.hello("robot").replace(right, wrong, 1))
             heard = await stranger.end()
-        assert (len(heard), ear.items, len(ear.warnings)) == (2 if channel else 0, [], 1)
+        assert (heard, ear.items, len(ear.warnings)) == ([], [], 1)
 
 
 async def test_a_program_on_the_loopback_that_does_not_know_the_key_is_not_heard(directory: str) -> None:
@@ -342,7 +384,7 @@ async def test_a_program_on_the_loopback_that_does_not_know_the_key_is_not_heard
         port = int(path.read_text().split()[0])
         stranger = RawPeer(await anyio.connect_tcp("127.0.0.1", port))
         async with stranger.stream:
-            await stranger.say(stranger.hello(), b"all")
+            await stranger.say(stranger.hello())
             assert await stranger.end() == []
         assert ear.items == []
         assert path.stat().st_mode & 0o777 == 0o600
@@ -544,9 +586,9 @@ async def test_links_work_where_the_system_has_no_poll_object_that_is_a_file(
     large = bytes(1_000_000)
     one = LocalWire(DOMAIN, directory=directory, loopback=loopback)
     async with running(one) as ear:
-        async with pair(directory, loopback) as (two, _, three, _):
-            await ear.joined(two.id)
-            await ear.joined(three.id)
+        async with pair(directory, loopback) as (two, ear_two, three, ear_three):
+            await ear_two.joined(one.id)
+            await ear_three.joined(one.id)
             assert two.send(one.id, large)
             assert three.is_heard("all")
             three.publish("all", b"to all")

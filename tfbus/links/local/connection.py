@@ -6,7 +6,7 @@ import selectors
 import socket
 import struct
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from selectors import EVENT_READ, EVENT_WRITE
 from time import monotonic
 from typing import Any, Final
@@ -15,14 +15,14 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 
-from tfbus.links.seams import MAX_MESSAGE
+from tfbus.links.seams import MAX_MESSAGE, Hearing, first_match
 from tfbus.tf_message import MalformedMessageError
 
 MOST_PUBLISHED: Final = 2**23
 """Bytes of published messages that wait for one link, before the oldest are dropped."""
 MOST_SENT: Final = 2**24
 """Bytes of sent messages that wait for one link, before further ones are refused."""
-LONGEST_HELLO: Final = 2**14
+LONGEST_HELLO: Final = 2**18
 MOST_AT_ONCE: Final = 2**18
 """Bytes that are written to one socket before others have their turn."""
 READ_AT_ONCE: Final = 2**15
@@ -31,9 +31,9 @@ KEY: Final = 32
 """Bytes of a key; the side that connects says the first half, and the other side the second half."""
 LENGTH: Final = struct.Struct("<I")
 _LOOK_AGAIN: Final = 0.02
-_PROTOCOL = b"tfbus local 2\n"
-_HELLO = re.compile(_PROTOCOL + rb"(?P<link>[0-9a-f]{32})(?P<key>.{16})(?P<robot>[\w.-]{0,200})", re.DOTALL)
-_CHANNEL = re.compile(rb"[A-Za-z0-9_-]{0,32}")
+_PROTOCOL = b"tfbus local 3\n"
+_HEARS = rb"(?P<hears>(?:\n[\w.*-]{0,200} [\w-]{1,32})*)"
+_HELLO = re.compile(_PROTOCOL + rb"(?P<link>[0-9a-f]{32})(?P<key>.{16})(?P<robot>[\w.-]{0,200})" + _HEARS, re.DOTALL)
 _FLAGS = getattr(socket, "MSG_NOSIGNAL", 0)
 
 
@@ -55,14 +55,11 @@ class Poll:
 
     def watch(self, sock: socket.socket, owner: object, events: int) -> None:
         """Wait on a socket for bytes, for room, for both, or no more; the last before it is closed."""
-        try:
-            if events:
-                self._selector.modify(sock, events, owner)
-            else:
-                self._selector.unregister(sock)
-        except KeyError:
-            if events:
-                self._selector.register(sock, events, owner)
+        # After `close` there is no map.
+        if sock in (self._selector.get_map() or ()):
+            self._selector.unregister(sock)
+        if events:
+            self._selector.register(sock, events, owner)
 
     def ready(self, patience: float = 0.0) -> list[tuple[selectors.SelectorKey, int]]:
         """The sockets that are ready, with whether there are bytes to read, and room to write."""
@@ -93,8 +90,27 @@ class Poll:
         self._selector.close()
 
 
+class Frames:
+    """A queue of frames, with the bytes of all of them."""
+
+    def __init__(self) -> None:
+        self.size: int = 0
+        self._frames: deque[bytes] = deque()
+
+    def put(self, frame: bytes) -> None:
+        """Append a frame."""
+        self._frames.append(frame)
+        self.size += len(frame)
+
+    def take(self) -> bytes:
+        """Remove and return the oldest frame; empty if there is none."""
+        frame = self._frames.popleft() if self._frames else b""
+        self.size -= len(frame)
+        return frame
+
+
 class Connection:
-    """One connection. It is *met* when both sides have told who they are and what they hear.
+    """One connection. It is *met* when the other side has said hello.
 
     Parameters
     ----------
@@ -111,12 +127,11 @@ class Connection:
     Attributes
     ----------
     link, robot : str
-        Of the other side; empty until it has said them.
-    heard : str or None
-        The channel that this link hears of the other.
+        Of the other side; `link` is empty until the connection is met.
+    heard : bool
+        Whether this link hears the other.
     hears : str or None
         The channel that the other hears of this one.
-    met, closed : bool
     waits : bool
         Whether anything waits for room.
     begun, grown : float
@@ -135,17 +150,14 @@ class Connection:
         self.grown: float = self.begun
         self.link: str = ""
         self.robot: str = ""
-        self.heard: str | None = None
+        self.heard: bool = False
         self.hears: str | None = None
-        self.met: bool = False
-        self.closed: bool = False
         self.tail: bytearray = bytearray()
         self.waits: bool = waits
         # The rest of the frame that is written next: nothing goes before it.
         self._begun: bytes | memoryview = b""
-        self._sent: deque[bytes] = deque()
-        self._published: deque[bytes] = deque()
-        self._size_sent = self._size_published = 0
+        self._sent = Frames()
+        self._published = Frames()
         self._watch()
 
     def _watch(self) -> None:
@@ -155,56 +167,41 @@ class Connection:
 
     def publish(self, frame: bytes) -> None:
         """Write a frame at once, or have it wait; the oldest that wait are dropped."""
+        self._published.put(frame)
+        while self._published.size > MOST_PUBLISHED:
+            self._published.take()
         if not self.waits:
-            self._begun = frame
             self.flush()
-            return
-        self._published.append(frame)
-        self._size_published += len(frame)
-        while self._size_published > MOST_PUBLISHED:
-            self._size_published -= len(self._published.popleft())
 
     def send(self, frame: bytes) -> bool:
         """Write a frame at once, or have it wait before all that are published; False if there is no room."""
-        if not self.waits:
-            self._begun = frame
-            self.flush()
-        elif self._size_sent + len(frame) > MOST_SENT:
+        if self._sent.size + len(frame) > MOST_SENT:
             return False
-        else:
-            self._sent.append(frame)
-            self._size_sent += len(frame)
+        self._sent.put(frame)
+        if not self.waits:
+            self.flush()
         return True
 
     def flush(self) -> None:
         """Write the waiting frames, as far as there is room."""
-        written, most = 1, MOST_AT_ONCE
-        while written and most > 0 and (frame := self._begun or self._next_frame()):
+        most = MOST_AT_ONCE
+        while frame := self._begun or self._sent.take() or self._published.take():
+            self._begun = frame
+            if most <= 0:
+                break
             try:
                 written = self.sock.send(frame, _FLAGS)
             except BlockingIOError:
-                written = 0
+                break
             except OSError:
                 # The other side reads no more. The reading finds the end, after all that the other has written before.
                 written = len(frame)
             self._begun = memoryview(frame)[written:] if written < len(frame) else b""
             most -= written
-        waits = bool(self._begun or self._sent or self._published)
+        waits = bool(self._begun)
         if waits is not self.waits:
             self.waits = waits
             self._watch()
-
-    def _next_frame(self) -> bytes:
-        """Take the next frame from its queue; empty if none waits."""
-        if self._sent:
-            frame = self._sent.popleft()
-            self._size_sent -= len(frame)
-        elif self._published:
-            frame = self._published.popleft()
-            self._size_published -= len(frame)
-        else:
-            frame = b""
-        return frame
 
     async def drain(self) -> None:
         """Wait until all that waits has been written, instead of the poll."""
@@ -231,7 +228,7 @@ class Connection:
         at = 0
         while len(self.tail) - at >= LENGTH.size:
             (length,) = LENGTH.unpack_from(self.tail, at)
-            longest = MAX_MESSAGE if self.met else LONGEST_HELLO
+            longest = MAX_MESSAGE if self.link else LONGEST_HELLO
             if length > longest:
                 raise MalformedMessageError("oversized", f"a message of {length} bytes, where {longest} are the most")
             start, end = at + LENGTH.size, at + LENGTH.size + length
@@ -244,34 +241,32 @@ class Connection:
 
     # Meeting
 
-    def say_hello(self, link: str, robot: str) -> None:
-        """Send the first message of a link, which names it, and shows that it knows the key."""
-        self.send(frame_of(_PROTOCOL + link.encode() + self._said + robot.encode()))
+    def say_hello(self, link: str, robot: str, hears: Sequence[Hearing]) -> None:
+        """Send the first message of a link, which names it and what it hears, and shows that it knows the key."""
+        hearings = "".join(f"\n{one.robots} {one.channel}" for one in hears)
+        self.send(frame_of(_PROTOCOL + link.encode() + self._said + f"{robot}{hearings}".encode()))
 
-    def take_hello(self, content: bytes) -> None:
-        """Take the other's first message; raises `ValueError` if it is none, or does not know the key."""
+    def take_hello(self, content: bytes, robot: str, hears: Sequence[Hearing]) -> None:
+        """Take the other's first message, for a link of this robot, which hears so.
+
+        Raises
+        ------
+        ValueError
+            If it is no hello, or does not know the key.
+        """
         hello = _HELLO.fullmatch(content)
         if hello is None:
-            raise ValueError(f"a link says {content[:100]!r}, and {_PROTOCOL!r}, an id, a key and a robot are a hello")
+            parts = f"{_PROTOCOL!r}, an id, a key, a robot and hearings"
+            raise ValueError(f"a link says {content[:100]!r}, and {parts} are a hello")
         if not hmac.compare_digest(hello["key"], self._awaited):
             raise ValueError("a link does not know the key")
         self.link, self.robot = hello["link"].decode(), hello["robot"].decode()
-
-    def say_welcome(self, heard: str | None) -> None:
-        """Send the second message: the channel that this link hears of the other."""
-        self.heard = heard
-        self.send(frame_of((heard or "").encode()))
-
-    def take_welcome(self, content: bytes) -> None:
-        """Take the other's second message; raises `ValueError` if it names no channel."""
-        if not _CHANNEL.fullmatch(content):
-            raise ValueError("a welcome names no channel")
-        self.hears = content.decode() or None
-        self.met = True
+        self.heard = first_match(hears, self.robot) is not None
+        others = [Hearing(*line.split(" ")) for line in hello["hears"].decode().split("\n")[1:]]
+        hearing = first_match(others, robot)
+        self.hears = hearing and hearing.channel
 
     def close(self) -> None:
         """Close the socket; waiting frames are lost."""
-        self.closed = True
-        self.waits = False
         self._poll.watch(self.sock, self, 0)
         self.sock.close()

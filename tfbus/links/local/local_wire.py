@@ -10,25 +10,32 @@ Each side of a connection sends frames: a length (u32, little-endian) and as man
 ======  ======================  ============================================================================
 frame   what it is              its bytes
 ======  ======================  ============================================================================
-first   hello                   ``tfbus local 2\\n``, id (32), half of the key (16), robot
-second  welcome                 the channel that its sender hears of the other; empty for none
+first   hello                   ``tfbus local 3\\n``, id (32), half of the key (16), robot; then for each `Hearing`
+                                of its sender, in their order: ``\\n``, the pattern, a space, the channel
 others  messages                what `publish` and `send` were given
 ======  ======================  ============================================================================
 
-The side that has connected says hello first. The other side answers with hello and welcome, and the first side with
-its welcome. A connection is *met* for a side when it has both, so nothing that is sent after `Joined` can come too
-early. For Unix sockets the key is zeros, and the kernel tells the user of the other process. On the loopback the key
-stands in the file that names the port; the side that has connected says the first half, and the side that listens
-answers with the second. So a program that listens at the port of a link that has gone learns only a half that nobody
-asks for any more, and cannot answer.
+The side that has connected says hello first, and the other side answers with its own. A connection is *met* for a side
+that has read the other's hello, and nothing goes before a hello, so no message can come too early. For Unix sockets
+the key is zeros, and the kernel tells the user of the other process. On the loopback the key stands in the file that
+names the port; the side that has connected says the first half, and the side that listens answers with the second. So a
+program that listens at the port of a link that has gone learns only a half that nobody asks for any more, and cannot
+answer.
 
 Connecting
 ----------
-The younger link connects to the older ones, when it opens and whenever it looks into the directory; so two links never
-connect to each other, and one that was missed is met at the next look. A link looks often at first, and then every two
-seconds. A younger link that has not connected by then may have been killed: a connection on which nothing is said finds
-that out, and then its name is removed. An id in use is not taken over: another connection of that id is refused while
-the first one is there.
+The younger link connects to the older ones, when it opens and whenever it looks into the directory; one that was missed
+is met at the next look. A link looks often at first, and then every two seconds. Two links never greet each other on
+two connections:
+
+* Only the younger link says hello first. It has at most one connection to each older link, and waits on it for the
+  answer as long as the connection lasts, however late the answer is: the older link may be stopped, and go on later and
+  read the hello. So the side that listens is met when it has read the hello: the other has not gone meanwhile.
+* The older link chooses. It may end a connection whose hello it has not read, and the younger one then connects again.
+  An id in use is not taken over: another connection of that id is refused while the first one is there.
+
+A younger link that has not connected after some looks may have been killed. The older one connects to it and says
+nothing, only to find out whether anybody listens; if nobody does, it removes the name.
 
 Present and lost
 ----------------
@@ -42,8 +49,8 @@ Each connection queues at most 8 MiB of published messages, and then drops the o
 messages, which go first; a frame whose writing has begun is finished before. A message is at most `MAX_MESSAGE` long; a
 longer one ends its connection. All unfinished messages have at most 64 MiB together; beyond that, the connection whose
 message has not grown for the longest time is closed. There are at most 1,000 connections. Of the incoming connections
-that are not met, the newest 64 are kept, for 10 s. One turn of the event loop reads for about a millisecond,
-and one read more.
+that are not met, the newest 64 are kept, for 10 s. A hello has at most 256 KiB, which is room for 1,000 names of robots
+that its sender hears. One turn of the event loop reads for about a millisecond, and one read more.
 """
 
 import os
@@ -63,16 +70,18 @@ import anyio.lowlevel
 from tfbus._aio.turn_budget import TurnBudget
 from tfbus.links.local.connection import Connection, Poll, frame_of
 from tfbus.links.local.meeting_place import MeetingPlace
-from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire, first_match
+from tfbus.links.seams import MAX_MESSAGE, Hearing, Joined, Left, Receive, Wire
 from tfbus.tf_message import MalformedMessageError
 
 MOST_CONNECTIONS: Final = 1_000
 MOST_STRANGERS: Final = 64
 """The most incoming connections that are not met yet."""
+MOST_HEARINGS: Final = 1_000
+"""The most names of robots that a link hears, so that its hello is not too long."""
 MOST_UNFINISHED: Final = 2**26
 """Bytes of all unfinished messages together."""
 PATIENCE: Final = 10.0
-"""s until a connection has to be met."""
+"""s until an incoming connection has to be met."""
 _OFTEN, _RARELY = 0.01, 2.0
 _FLUSH_TIME = 1.0
 
@@ -108,9 +117,7 @@ class LocalWire(Wire):
     ) -> None:
         self.id: str = secrets.token_hex(16)
         self._robot = robot
-        self._place = MeetingPlace(
-            domain, self.id, directory, not hasattr(socket, "AF_UNIX") if loopback is None else loopback
-        )
+        self._place = MeetingPlace(domain, self.id, directory, loopback)
         self._listener: socket.socket | None = None
         # All connections, the oldest first; and the met ones, by the ids of the other links.
         self._connections: dict[Connection, None] = {}
@@ -120,10 +127,11 @@ class LocalWire(Wire):
         self._ready: deque[tuple[SelectorKey, int]] = deque()
 
     async def open(self, hears: Sequence[Hearing], receive: Receive, warn: Callable[[Exception], object]) -> None:
+        if len(hears) > MOST_HEARINGS:
+            raise OSError(f"a link hears {MOST_HEARINGS} names of robots at most, and {len(hears)} are given")
         self._hears, self._receive, self._warn = tuple(hears), receive, warn
         self._poll = Poll()
         _open_wires.add(self)
-        self._listen()
         self._look()
         await anyio.lowlevel.checkpoint()
 
@@ -160,10 +168,12 @@ class LocalWire(Wire):
                     for connection in self._links.values():
                         tasks.start_soon(connection.drain)
         finally:
-            self._close_sockets()
-            self._poll.close()
+            self.abandon()
 
-    def _close_sockets(self) -> None:
+    def abandon(self) -> None:
+        """Close all sockets at once, and leave the name; a child process does no more, for all is its parent's."""
+        # The poll object first: a child process shares it with its parent, for which it has to stay as it is.
+        self._poll.close()
         self._stop_listening()
         for connection in self._connections:
             connection.close()
@@ -172,47 +182,39 @@ class LocalWire(Wire):
 
     # Listening and dialling
 
-    def _listen(self) -> None:
-        """Show the link's name, also when it has vanished."""
-        listener = self._place.open()
-        self._stop_listening()
-        self._listener = listener
-        self._poll.watch(listener, None, EVENT_READ)
-
     def _stop_listening(self) -> None:
         if self._listener is not None:
             self._poll.watch(self._listener, None, 0)
             self._listener.close()
 
     async def _meet(self) -> None:
-        """Look for older links, and end connections that are not met in time."""
+        """Look for older links, and end incoming connections that are not met in time."""
         pause = _OFTEN
         while True:
             await anyio.sleep(pause * uniform(0.8, 1.2))
             pause = min(3 * pause, _RARELY)
-            if self._listener is not None:
-                # There may be free files again.
-                self._poll.watch(self._listener, None, EVENT_READ)
             begun = monotonic() - PATIENCE
-            for connection in [each for each in self._connections if not each.met and each.begun < begun]:
-                self._end(connection)
-            # A younger link connects by itself, unless it was killed.
-            self._look(younger=pause == _RARELY)
+            for stranger in self._strangers():
+                if stranger.begun < begun:
+                    self._end(stranger)
+            try:
+                # A younger link connects by itself, unless it was killed.
+                self._look(younger=pause == _RARELY)
+            except OSError as error:
+                self._warn(error)
 
     def _look(self, younger: bool = False) -> None:
-        """Connect to the older links that are not met, or to all, and show this link's name if it has vanished."""
-        try:
-            names = self._place.names()
-            if self._place.name not in names:
-                self._listen()
-        except OSError as error:
-            self._warn(error)
-            return
-        dialled = {connection.dialled for connection in self._connections}
-        met = {link[:8] for link in self._links}
-        for name in names:
-            is_wanted = name < self._place.name or (younger and name != self._place.name)
-            if is_wanted and name not in dialled and name[-8:] not in met and not self._is_full():
+        """Connect to the older links that are not met, or to all, and show this link's name unless it is there."""
+        if self._listener is None or self._place.name not in self._place.names():
+            listener = self._place.open()
+            self._stop_listening()
+            self._listener = listener
+        # Again, because there may be free files after there were none.
+        self._poll.watch(self._listener, self._listener, EVENT_READ)
+        # A name ends with the beginning of the id.
+        known = {self.id[:8], *(each.dialled[-8:] or each.link[:8] for each in self._connections)}
+        for name in self._place.names():
+            if name[-8:] not in known and (younger or name < self._place.name) and not self._is_full():
                 self._dial(name)
 
     def _is_full(self) -> bool:
@@ -233,35 +235,30 @@ class LocalWire(Wire):
         connection = Connection(sock, self._poll, key, name, waits=self._place.loopback)
         self._connections[connection] = None
         if name < self._place.name:
-            connection.say_hello(self.id, self._robot)
+            connection.say_hello(self.id, self._robot, self._hears)
 
-    def _accept(self) -> None:
-        assert self._listener is not None
+    def _accept(self, listener: socket.socket) -> None:
         try:
-            sock, _ = self._listener.accept()
+            sock = self._place.accept(listener)
         except (BlockingIOError, ConnectionAbortedError):
             return
         except OSError as error:
-            # There are too many open files. Existing connections go on, and the next look tries again.
             self._warn(error)
-            self._poll.watch(self._listener, None, 0)
+            if not isinstance(error, PermissionError):
+                # There are too many open files. Existing connections go on, and the next look tries again.
+                self._poll.watch(listener, listener, 0)
             return
-        try:
-            self._place.prepare(sock)
-        except OSError as error:
-            sock.close()
-            self._warn(error)
-            return
-        strangers = [each for each in self._connections if not each.met and not each.dialled]
+        strangers = self._strangers()
         if len(strangers) >= MOST_STRANGERS:
             self._end(strangers[0])
         if self._is_full():
             sock.close()
             return
-        connection = Connection(sock, self._poll, self._place.key)
-        self._connections[connection] = None
-        # Mostly the hello is there already, so links that connect all at once do not push each other out.
-        self._read(connection)
+        self._connections[Connection(sock, self._poll, self._place.key)] = None
+
+    def _strangers(self) -> list[Connection]:
+        """The incoming connections that are not met, the oldest first."""
+        return [each for each in self._connections if not each.dialled and not each.link]
 
     # Moving bytes
 
@@ -272,25 +269,21 @@ class LocalWire(Wire):
         self._ready = self._ready or deque(self._poll.ready())
         while self._ready and not self._budget.spent:
             key, events = self._ready.popleft()
-            connection = key.data
-            if connection is None:
-                self._accept()
-                continue
+            if self._listener and key.data is self._listener:
+                self._accept(self._listener)
             # The reading first: it tells the error of a socket, and ends its connection.
-            if events & EVENT_READ and not connection.closed:
-                self._read(connection)
-            if events & EVENT_WRITE and not connection.closed:
-                connection.flush()
+            if events & EVENT_READ and key.data in self._connections:
+                self._read(key.data)
+            if events & EVENT_WRITE and key.data in self._connections:
+                key.data.flush()
 
     def _read(self, connection: Connection) -> None:
         try:
             for content in connection.read():
-                if connection.met:
+                if connection.link:
                     self._receive(connection.link, content)
                 else:
                     self._greet(connection, content)
-                if connection.closed:
-                    return
         except BlockingIOError:
             return
         except OSError as error:
@@ -307,7 +300,7 @@ class LocalWire(Wire):
                 self._refuse(idle, MalformedMessageError("oversized", "unfinished messages of all links are too large"))
 
     def _refuse(self, connection: Connection, error: ValueError) -> None:
-        if connection.met and isinstance(error, MalformedMessageError):
+        if connection.link and isinstance(error, MalformedMessageError):
             self._receive(connection.link, error)
         else:
             self._warn(error)
@@ -319,41 +312,35 @@ class LocalWire(Wire):
         del self._connections[connection]
         if self._links.get(connection.link) is connection:
             del self._links[connection.link]
-            if connection.heard is not None:
+            if connection.heard:
                 self._receive(connection.link, Left())
 
     def _greet(self, connection: Connection, content: bytes) -> None:
-        """Take a hello or a welcome; raises `ValueError` if it is none."""
-        if connection.link:
-            connection.take_welcome(content)
-        else:
-            connection.take_hello(content)
-        if connection.link == self.id or connection.link in self._links:
-            self._end(connection)
-        elif connection.met:
-            self._links[connection.link] = connection
-            if connection.heard is not None:
-                self._receive(connection.link, Joined(connection.robot))
-        else:
-            if not connection.dialled:
-                connection.say_hello(self.id, self._robot)
-            hearing = first_match(self._hears, connection.robot)
-            connection.say_welcome(hearing and hearing.channel)
+        """Take a hello, and answer it unless this side has connected.
 
-    def abandon(self) -> None:
-        """Forget everything in a child process, where it belongs to the parent."""
-        self._place.name = ""
-        self._poll.close()
-        self._close_sockets()
+        Raises
+        ------
+        ValueError
+            If it is no hello, or does not know the key.
+        ConnectionAbortedError
+            If its link is connected already.
+        """
+        connection.take_hello(content, self._robot, self._hears)
+        if connection.link == self.id or connection.link in self._links:
+            raise ConnectionAbortedError(f"the link {connection.link} is connected already")
+        if not connection.dialled:
+            connection.say_hello(self.id, self._robot, self._hears)
+        self._links[connection.link] = connection
+        if connection.heard:
+            self._receive(connection.link, Joined(connection.robot))
 
 
 _open_wires: WeakSet[LocalWire] = WeakSet()
 
 
 def _abandon_all() -> None:
-    for wire in _open_wires:
-        wire.abandon()
-    _open_wires.clear()
+    while _open_wires:
+        _open_wires.pop().abandon()
 
 
 if hasattr(os, "register_at_fork"):

@@ -12,7 +12,6 @@ checked before anything is trusted.
 """
 
 import os
-import re
 import secrets
 import socket
 import stat
@@ -83,8 +82,9 @@ class MeetingPlace:
         The id of the link.
     directory : str, optional
         The directory of the user; by default that of the environment.
-    loopback : bool
-        Whether to use ports of the loopback instead of Unix sockets. Links of one domain meet if they agree.
+    loopback : bool, optional
+        Whether to use ports of the loopback instead of Unix sockets; by default only where there are none. Links of one
+        domain meet if they agree.
 
     Attributes
     ----------
@@ -94,12 +94,13 @@ class MeetingPlace:
         The users who may read the file know it; zeros for Unix sockets, where the kernel tells who connects.
     """
 
-    def __init__(self, domain: str, link: str, directory: str | None, loopback: bool) -> None:
+    def __init__(self, domain: str, link: str, directory: str | None, loopback: bool | None) -> None:
         self._directory = runtime_directory() if directory is None else Path(directory)
-        kind = "loopback" if loopback else "unix"
+        self.loopback: bool = not hasattr(socket, "AF_UNIX") if loopback is None else loopback
+        self._family = socket.AF_INET if self.loopback else socket.AF_UNIX
+        kind = "loopback" if self.loopback else "unix"
         self._domain = blake2b(f"{kind} {domain}".encode(), digest_size=6).hexdigest()
         self._link = link
-        self.loopback = loopback
         self.name: str = ""
         self.key: bytes = bytes(KEY)
 
@@ -121,15 +122,13 @@ class MeetingPlace:
 
     def _listen(self) -> socket.socket:
         path = self._directory / self.name
-        length = len(os.fsencode(path))
-        if not self.loopback and length > LONGEST_PATH:
-            raise OSError(
-                f"the path of a socket may have {LONGEST_PATH} bytes, and {path} is {length} and too long: "
-                "set TFBUS_RUNTIME_DIR to a shorter path"
-            )
+        if not self.loopback and len(os.fsencode(path)) > LONGEST_PATH:
+            problem = f"the path of a socket may have {LONGEST_PATH} bytes, and {path} is too long"
+            raise OSError(f"{problem}: set TFBUS_RUNTIME_DIR to a shorter path")
         make_private(self._directory)
-        listener = self._socket()
+        listener = socket.socket(self._family)
         try:
+            listener.setblocking(False)
             listener.bind(("127.0.0.1", 0) if self.loopback else str(path))
             listener.listen(BACKLOG)
             if self.loopback:
@@ -142,17 +141,9 @@ class MeetingPlace:
             raise
         return listener
 
-    def _socket(self) -> socket.socket:
-        sock = socket.socket(socket.AF_INET if self.loopback else socket.AF_UNIX)
-        sock.setblocking(False)
-        return sock
-
     def names(self) -> list[str]:
         """The names of all links, and of this one unless somebody has removed it; raises `OSError`."""
-        of_link = re.compile(f"{self._domain}-[0-9a-f]{{24}}").fullmatch
-        with suppress(FileNotFoundError):
-            return [path.name for path in self._directory.iterdir() if of_link(path.name)]
-        return []
+        return [path.name for path in self._directory.glob(f"{self._domain}-{'[0-9a-f]' * 24}")]
 
     def dial(self, name: str) -> tuple[socket.socket, bytes]:
         """Connect to a link without waiting; returns the socket and the key.
@@ -162,11 +153,14 @@ class MeetingPlace:
         Raises
         ------
         OSError
-            If the link is not there or has no room. If its file has no listener, the file is removed.
+            If the link is not there or has no room.
+        ConnectionRefusedError
+            If its file has no listener, or is no file of a link; then the file is removed.
         """
         path, key = self._directory / name, self.key
-        sock = self._socket()
+        sock = socket.socket(self._family)
         try:
+            sock.setblocking(False)
             if self.loopback:
                 port, _, digits = path.read_text().partition(" ")
                 key = bytes.fromhex(digits)
@@ -174,23 +168,34 @@ class MeetingPlace:
                     sock.connect(("127.0.0.1", int(port)))
             else:
                 sock.connect(str(path))
-            self.prepare(sock)
+            self._prepare(sock)
         except (OSError, ValueError, OverflowError) as error:
             sock.close()
             if isinstance(error, OSError) and not isinstance(error, ConnectionRefusedError):
                 raise
             self.remove(name)
-            raise ConnectionRefusedError(f"nobody listens for {path}") from error
+            raise ConnectionRefusedError(f"nobody listens at {path}") from error
         return sock, key
 
-    def prepare(self, sock: socket.socket) -> None:
-        """Make the socket of a new connection ready for use.
+    def accept(self, listener: socket.socket) -> socket.socket:
+        """Accept a connection that waits.
 
         Raises
         ------
         PermissionError
             If a process of another user has the other end.
+        OSError
+            If none waits, or there is no free file.
         """
+        sock, _ = listener.accept()
+        try:
+            self._prepare(sock)
+        except OSError:
+            sock.close()
+            raise
+        return sock
+
+    def _prepare(self, sock: socket.socket) -> None:
         sock.setblocking(False)
         if self.loopback:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
