@@ -455,9 +455,11 @@ class Replica:
 
     def widen(self, known: Known, views: "Iterable[View]") -> None:
         """Let an entry be in some views too."""
-        new = [view for view in views if view not in known.views and view.holds(known.frame)]
+        new = tuple(view for view in views if view not in known.views and view.holds(known.frame))
         if new:
-            known.views += (*new,)
+            # Most entries share the tuple of their route, for the garbage collector looks at each.
+            is_route = not known.views and new == known.route
+            known.views = known.route if is_route else known.views + new
             for view in new:
                 view.digest ^= known.digest
             if known.sequence:
