@@ -27,6 +27,7 @@ from itertools import islice, repeat
 from typing import Any, Final, Generic, NamedTuple, TypeVar, cast, overload
 
 from tfbus.errors import InvalidTransformError
+from tfbus.frames import is_frame
 from tfbus.geometry.stamped import Fields, TransformStamped
 from tfbus.geometry.transform import Transform
 from tfbus.plain import printable
@@ -304,6 +305,10 @@ def _transforms_of(
         piece = body[at + 8 : end]
         at = end + 56
         names = names_of(piece)
+        if names is None:
+            names = _new_names(piece, layout, bare_names)
+            if names is not None:
+                _cache(cache, piece, names, len(piece))
         unit: Row | None = row
         if not -ROUNDING <= i * i + j * j + k * k + w * w - 1.0 <= ROUNDING:
             unit = _normalised(row)
@@ -319,7 +324,6 @@ def _transforms_of(
                 errors.append(error.with_traceback(None))
                 samples.append(None)
                 continue
-            _cache(cache, piece, fields[:2], len(piece))
         sample = make(kind)
         sample._fields = fields
         samples.append(sample)
@@ -333,6 +337,14 @@ def _normalised(row: Row) -> Row | None:
     if not abs(norm - 1.0) <= NORM_TOLERANCE:
         return None
     return x, y, z, i / norm, j / norm, k / norm, w / norm
+
+
+def _new_names(piece: bytes, layout: _Layout, bare: bool) -> tuple[str, str] | None:
+    """The two names of a piece; None if they cannot be the frames of a sample."""
+    parent, child = (_name(text, bare) for text in _split_names(piece, layout))
+    if parent is None or child is None or parent == child or not (is_frame(parent) and is_frame(child)):
+        return None
+    return parent, child
 
 
 def _split_names(piece: bytes, layout: _Layout) -> Iterator[bytes]:

@@ -274,6 +274,21 @@ def test_a_silent_peer_without_a_sign_of_life_is_asked_ever_less_often_and_other
     assert link.next_question(0.0) == Question("b", 0)
 
 
+def test_a_peer_that_still_fetches_the_copies_of_others_is_asked_once_it_has_them_or_after_ten_seconds() -> None:
+    link = Asker("a", "b")
+    link.answer(link.next_question(0.0) or Question("", 0))
+    link.say("b", heard=False)
+    for _ in range(3):
+        link.agreement.told("b", link.peers["b"].claim(link.now)._replace(final=False), link.now)
+        assert link.next_question(3.0) is None
+    assert link.next_question(1.1) == Question("b", 0)
+    link.answer(Question("b", 0))
+    link.say("b", heard=False)
+    link.agreement.told("b", link.peers["b"].claim(link.now)._replace(final=False), link.now)
+    link.sign("b")
+    assert link.next_question(0.7) == Question("b", 1)
+
+
 def test_a_link_that_is_behind_asks_only_the_first_question_at_once_and_one_in_ten_seconds() -> None:
     link = Asker("a", "b")
     link.is_behind = True

@@ -14,7 +14,7 @@ from support.samples import moving, static
 
 from tfbus import PeerLost, PeerRejected, TransformStamped
 from tfbus.links.endpoint import MAX_AUTHORITIES
-from tfbus.links.message import VERSION, Kind, Outgoing, read_message, write_body, write_message
+from tfbus.links.message import VERSION, Heard, Kind, Outgoing, read_message, split_clocks, write_body, write_message
 from tfbus.links.relay import LARGEST_JUMP
 from tfbus.links.replica import MANY_ORIGINS, Claim, OutgoingBatch, RemovedFrame
 
@@ -207,6 +207,24 @@ def test_whoever_misses_a_message_asks_soon(scene: Scene) -> None:
     scene.stranger.say(number=3)
     scene.world.run(0.3)
     assert len(scene.stranger.heard(Kind.QUESTION)) == 1
+
+
+def test_a_link_says_in_its_signs_that_it_has_not_fetched_all(scene: Scene) -> None:
+    def last_sign() -> Claim:
+        scene.stranger.items.clear()
+        scene.world.run(2.5)
+        (sign,) = read_message(split_clocks(scene.stranger.heard(Kind.SIGN)[-1])[0])
+        assert isinstance(sign, Heard)
+        return sign.claim
+
+    for number in (1, 3):
+        scene.stranger.say(number=number)
+    scene.world.run(0.3)
+    assert last_sign().final
+    scene.stranger.say(kind=Kind.ANSWER, claim=Claim(0, 1, 0, final=False))
+    assert not last_sign().final
+    scene.stranger.say(kind=Kind.ANSWER, claim=Claim(1, 2, 0))
+    assert last_sign().final
 
 
 # Refused samples

@@ -112,6 +112,61 @@ class _TrioWakeUp:
         return _lowlevel().Abort.SUCCEEDED
 
 
+class _TrioCalls:
+    """Calls functions on the running loop of trio in its next turn, for the loop's own thread.
+
+    A task waits for them, so that nothing goes through the socket by which `trio.lowlevel.TrioToken` wakes the loop:
+    that takes several system calls.
+    """
+
+    def __init__(self, token: Any) -> None:
+        self._token = token
+        self._functions: list[Callable[[], object]] = []
+        self._woken = _TrioWakeUp()
+        self._ended = False
+        _lowlevel().spawn_system_task(self._run)
+
+    def call_soon(self, function: Callable[[], object]) -> None:
+        """Call a function in the next turn; it must not raise."""
+        # Code outside of all tasks cannot wake a task: at the end of trio, and beside it where it is a guest.
+        if self._ended or here.name is None:
+            self._token.run_sync_soon(function)
+        else:
+            self._functions.append(function)
+            self._woken.end()
+
+    async def _run(self) -> None:
+        try:
+            while True:
+                self._woken = _TrioWakeUp()
+                if self._functions:
+                    # Other tasks get their turn first.
+                    await _lowlevel().checkpoint()
+                else:
+                    await asleep(self._woken.sleep())
+                self._call_all()
+        finally:
+            self._ended = True
+            del _trio_calls[self._token]
+            self._call_all()
+
+    def _call_all(self) -> None:
+        functions, self._functions = self._functions, []
+        for function in functions:
+            function()
+
+
+_trio_calls: dict[Any, _TrioCalls] = {}
+"""By the tokens of the running loops."""
+
+
+def _call_soon_on_trio(token: Any) -> Callable[[Callable[[], object]], object]:
+    """The function that has the running loop of trio call another one in its next turn."""
+    if token not in _trio_calls:
+        _trio_calls[token] = _TrioCalls(token)
+    return _trio_calls[token].call_soon
+
+
 class LoopWaker:
     """Calls a function on the event loop soon after a thread has asked for it.
 
@@ -148,8 +203,8 @@ class LoopWaker:
         # anyio has no public function for this; only the loops' own functions wake them from a thread.
         self._loop = native = cast(Any, anyio.lowlevel.current_token().native_token)
         self._call_soon = getattr(native, "run_sync_soon", None) or native.call_soon_threadsafe
-        # On the loop's own thread, asyncio needs no byte through its socket pair to wake up.
-        self._call_soon_here = getattr(native, "call_soon", self._call_soon)
+        # On the loop's own thread, no byte through a socket pair is needed to wake it up.
+        self._call_soon_here = getattr(native, "call_soon", None) or _call_soon_on_trio(native)
         self._thread = threading.get_ident()
         # trio answers each request that it has accepted. An asyncio loop may be closed with requests left.
         self._loop_is_closed = getattr(native, "is_closed", _never)

@@ -98,11 +98,11 @@ class Channels:
             else:
                 channel.number += 1
 
-    def sign(self, view: View, now: float, reach: Sequence[Way], serves: bool, clocks: bytes) -> None:
-        """Publish a sign of life on each channel."""
+    def sign(self, view: View, is_whole: bool, now: float, reach: Sequence[Way], serves: bool, clocks: bytes) -> None:
+        """Publish a sign of life on each channel; `is_whole` says whether no answers are being fetched."""
         for channel in list(self._channels):
             if self._is_heard(channel, now):
-                claim = view.claim(now, channel.frames)
+                claim = view.claim(now, channel.frames)._replace(final=is_whole)
                 sign = Outgoing(Kind.SIGN, self._bus, channel.number, claim, self._time, reach, serves, clocks)
                 first, *others = channel.names
                 self._wire.publish(first, write_message(sign))

@@ -267,7 +267,8 @@ class DomainEnd(Endpoint):
         self._signed_at, self._sign_due = now, now + self._sign_period
         self.send()
         serves = self.lookups.server is not None
-        self._channels.sign(self.own, now, self._reach(), serves, self.clocks.section(answers=True))
+        is_whole = not self._agreement.fetches
+        self._channels.sign(self.own, is_whole, now, self._reach(), serves, self.clocks.section(answers=True))
         self._tell_offsets()
 
     def _reach(self) -> list[Way]:
@@ -277,7 +278,8 @@ class DomainEnd(Endpoint):
     def _meet(self, peer: Peer) -> None:
         """Send a new peer the entries that this link brings, or an empty meeting if they are too many."""
         self.send()
-        claim, clocks = self.own.claim(self._now()), self.clocks.section(answers=False)
+        claim = self.own.claim(self._now())._replace(final=not self._agreement.fetches)
+        clocks = self.clocks.section(answers=False)
         serves = self.lookups.server is not None
         out = Outgoing(Kind.MEETING, self._bus, 0, claim, self.time, self._reach(), serves, clocks)
         brought = [*islice(self.own.brought(self), CHUNK + 1)]

@@ -320,9 +320,9 @@ class Claim(NamedTuple):
     since, sequence : int
         An answer tells all changes behind `since` up to `sequence`.
     digest : int
-        The digest of the copy at `sequence`; 0 if `final` is not set.
+        The digest of the copy at `sequence`; 0 in an answer if `final` is not set.
     final : bool
-        Whether `sequence` is the newest.
+        Whether `sequence` is the newest; in a sign, whether the sender has fetched all answers.
     partial : bool
         Whether the sender's copy has only some frames.
     """
@@ -455,9 +455,11 @@ class Replica:
 
     def widen(self, known: Known, views: "Iterable[View]") -> None:
         """Let an entry be in some views too."""
-        new = [view for view in views if view not in known.views and view.holds(known.frame)]
+        new = tuple(view for view in views if view not in known.views and view.holds(known.frame))
         if new:
-            known.views += (*new,)
+            # Most entries share the tuple of their route, for the garbage collector looks at each.
+            is_route = not known.views and new == known.route
+            known.views = known.route if is_route else known.views + new
             for view in new:
                 view.digest ^= known.digest
             if known.sequence:
@@ -676,9 +678,15 @@ class Agreement:
     """Decides which peer a link asks next, so that its copies come to agree with the copies of its peers; see above.
 
     Nothing here knows an event loop: the caller hands in each time, in s of a monotonic clock.
+
+    Attributes
+    ----------
+    fetches : bool
+        Whether a peer tells its copy in several answers, and the last one has not come yet.
     """
 
     def __init__(self) -> None:
+        self.fetches: bool = False
         self._copies: dict[str, _Copy] = {}
         self._remembered: dict[str, tuple[View, int]] = {}
         self._asked: Question | None = None
@@ -709,7 +717,7 @@ class Agreement:
             if len(self._remembered) > MOST_REMEMBERED:
                 del self._remembered[next(iter(self._remembered))]
         if self._asked is not None and self._asked.peer == peer:
-            self._asked = None
+            self._asked, self.fetches = None, False
             self._is_new = self._is_new or not any(other.seen for other in self._copies.values())
 
     def told(self, peer: str, claim: Claim, now: float, soon: bool = False) -> None:
@@ -728,7 +736,13 @@ class Agreement:
         if not copy.missed and self._agrees(copy, now):
             copy.seen, copy.due, copy.fruitless = claim.sequence, inf, 0
         elif claim.sequence > copy.seen:
-            pause = 0.0 if soon else min(uniform(0.3, 0.7) * 2**copy.fruitless, _LONGEST_PAUSE)
+            if not claim.final:
+                # What the peer still fetches may be here. Another sign follows soon, unless it never ends.
+                pause, soon = LONGEST_DELAY, False
+            elif soon:
+                pause = 0.0
+            else:
+                pause = min(uniform(0.3, 0.7) * 2**copy.fruitless, _LONGEST_PAUSE)
             copy.due, copy.urgent = min(copy.due, now + pause), copy.urgent or soon
 
     def missed(self, peer: str, now: float) -> None:
@@ -748,6 +762,7 @@ class Agreement:
             # An answer that leads nowhere.
             self._fail(copy, now)
             return
+        self.fetches = not claim.final
         copy.seen = claim.sequence
         copy.due, copy.urgent = now, True
         copy.again = now + _ASK_AGAIN if copy.must_ask else inf
@@ -822,6 +837,7 @@ class Agreement:
         return claim.digest ^ copy.view.claim(now, copy.frames).digest
 
     def _fail(self, copy: _Copy, now: float) -> None:
+        self.fetches = False
         copy.silences = min(copy.silences + 1, 10)
         copy.missed = True
         longest = _LONGEST_PAUSE
