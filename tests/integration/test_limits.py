@@ -21,6 +21,7 @@ links.replica.PATIENCE links.domain.MOST_QUESTIONS links.domain.SOONEST_SIGN lin
 links.channels.MOST_FILTERS links.channels.LONGEST_FILTER links.history.LONGEST_HISTORY links.history.MOST_OF_FRAME
 links.history.MOST_HELD links.history.MOST_HELD_SAMPLES links.history.PATIENCE links.local.local_wire.MOST_CONNECTIONS
 links.local.local_wire.MOST_STRANGERS links.local.local_wire.PATIENCE links.local.connection.LONGEST_HELLO
+links.local.local_wire.MOST_HEARINGS
 links.local.connection.MOST_PUBLISHED links.local.connection.MOST_SENT links.local.local_wire.MOST_UNFINISHED
 links.local.meeting_place.LONGEST_PATH links.zenoh.sessions.UNSENT links.zenoh.wire.MAX_LINKS
 links.zenoh.wire.MAX_CHANNELS links.zenoh.sessions.OPENING_TIME links.domain._LONGEST_NAME links.message.MAX_DEPTH
