@@ -238,26 +238,26 @@ class LocalWire(Wire):
         if name < self._place.name:
             connection.say_hello(self.id, self._robot, self._hears)
 
-    def _accept(self, listener: socket.socket) -> bool:
-        """Take a connection that waits; returns whether there was one."""
-        try:
-            sock = self._place.accept(listener)
-        except (BlockingIOError, ConnectionAbortedError):
-            return False
-        except OSError as error:
-            self._warn(error)
-            if not isinstance(error, PermissionError):
-                # There are too many open files. Existing connections go on, and the next look tries again.
-                self._poll.watch(listener, listener, 0)
-            return False
-        strangers = self._strangers()
-        if len(strangers) >= MOST_STRANGERS:
-            self._end(strangers[0])
-        if self._is_full():
-            sock.close()
-            return False
-        self._connections[Connection(sock, self._poll, self._place.key)] = None
-        return True
+    def _accept(self, listener: socket.socket) -> None:
+        """Accept connections that wait, some at once: on a crowded machine the next turn may be far."""
+        for _ in range(_ACCEPTED_AT_ONCE):
+            try:
+                sock = self._place.accept(listener)
+            except (BlockingIOError, ConnectionAbortedError):
+                return
+            except OSError as error:
+                self._warn(error)
+                if not isinstance(error, PermissionError):
+                    # There are too many open files. Existing connections go on, and the next look tries again.
+                    self._poll.watch(listener, listener, 0)
+                return
+            strangers = self._strangers()
+            if len(strangers) >= MOST_STRANGERS:
+                self._end(strangers[0])
+            if self._is_full():
+                sock.close()
+                return
+            self._connections[Connection(sock, self._poll, self._place.key)] = None
 
     def _strangers(self) -> list[Connection]:
         """The incoming connections that are not met, the oldest first."""
@@ -272,10 +272,8 @@ class LocalWire(Wire):
         self._ready = self._ready or deque(self._poll.ready())
         while self._ready and not self._budget.spent:
             key, events = self._ready.popleft()
-            for _ in range(_ACCEPTED_AT_ONCE):
-                # On a crowded machine the next turn may be far.
-                if not (self._listener and key.data is self._listener and self._accept(self._listener)):
-                    break
+            if self._listener and key.data is self._listener:
+                self._accept(self._listener)
             # The reading first: it tells the error of a socket, and ends its connection.
             if events & EVENT_READ and key.data in self._connections:
                 self._read(key.data)
