@@ -322,6 +322,16 @@ async def test_a_long_wait_is_asked_for_in_parts() -> None:
 
 
 @in_simulated_time
+@pytest.mark.parametrize(("timeout", "waited"), [(None, 3.0), (2.0, 2.0), (30.0, 3.0)])
+async def test_a_server_is_waited_for_three_seconds_at_most(timeout: float | None, waited: float) -> None:
+    async with DomainLink(Bus(), "tf", MemoryNetwork().wire()) as asker:
+        began = anyio.current_time()
+        with pytest.raises(RemoteLookupError, match="nobody offers it"):
+            await asker.lookup("map", "base", timeout=timeout)
+        assert anyio.current_time() - began == pytest.approx(waited)
+
+
+@in_simulated_time
 @pytest.mark.parametrize("lost", [Kind.LOOKUP, Kind.LOOKUP_ANSWER])
 async def test_what_is_dropped_is_asked_again_and_a_silent_server_is_given_up(lost: Kind) -> None:
     async with asked() as scene:

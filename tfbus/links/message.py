@@ -65,7 +65,7 @@ from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
 from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode_in_parts, encode, refusal
 from tfbus.uncertainty.answers import UncertainTransform
 
-VERSION = 6
+VERSION = 7
 MAX_BYTES = 2**22
 """The largest message with samples that is sent or read."""
 MAX_HEAD = 2**20
