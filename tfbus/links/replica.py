@@ -46,8 +46,8 @@ settled entries, so a frame that moves many times a second does not make copies 
    links would make each other busier.
 4. A link asks one question at a time. Answers are bounded, and the next question begins where the last answer ended.
    After an answer without news, the next question to that peer waits twice as long.
-5. A link that starts asks the first one that it meets for all at once. While it fetches the answers, its signs say so,
-   and others ask it only if that takes long: most of what it has by then came from them.
+5. A link that starts asks the first one that it meets for all at once. Its signs say so until it has all answers, and
+   others ask it meanwhile only if that takes long: most of what it has by then came from them.
 
 So all copies agree some seconds after any trouble, without one digest for each peer and without a leader.
 
@@ -738,7 +738,7 @@ class Agreement:
             copy.seen, copy.due, copy.fruitless = claim.sequence, inf, 0
         elif claim.sequence > copy.seen:
             if not claim.final:
-                # What the peer still fetches may be here. Another sign follows soon, unless it never ends.
+                # Most of what the peer still fetches is here. Its next sign comes soon, unless the fetching never ends.
                 pause, soon = LONGEST_DELAY, False
             elif soon:
                 pause = 0.0
