@@ -143,7 +143,9 @@ class Channels:
             for sample in entry.samples:
                 newest.pop(sample.child, None)
                 if not sample.static:
-                    newest[sample.child] = replace(entry, samples=(sample,))
+                    newest[sample.child] = OutgoingBatch(
+                        entry.origin, entry.sequence, (sample,), entry.clock, entry.shift
+                    )
 
     def _write(self, channel: _Channel, entries: Sequence[Entry]) -> None:
         """One message of all entries if possible, else several; a batch that is too large is left out and reported."""

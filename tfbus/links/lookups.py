@@ -25,6 +25,7 @@ from tfbus.bus.subscribers import OnceLogger
 from tfbus.errors import MAY_COME, LookupTimeoutError, RemoteLookupError, TransformError, TransformLookupError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.message import (
+    NUMBER,
     Kind,
     RemoteQuestion,
     read_answer,
@@ -43,8 +44,6 @@ LONGEST_WAIT = 10.0
 PATIENCE = 3.0
 """s; the longest wait for a server that has not joined yet, and for an answer that is late."""
 _MOST_SILENCES = 3
-_NUMBER = 8
-"""Bytes of the number before a question or an answer."""
 _ARGUMENTS = "target", "source", "at", "max_age", "source_at", "fixed", "tolerance", "max_gap", "covariance"
 
 
@@ -119,7 +118,7 @@ class RemoteLookups:
 
     def asked(self, asker: str, data: bytes) -> None:
         """Take a question of a link, or its cancellation: its number, and the question or nothing."""
-        number, question = int.from_bytes(data[:_NUMBER], "little"), data[_NUMBER:]
+        number, question = int.from_bytes(data[:NUMBER], "little"), data[NUMBER:]
         if self.server is None:
             self.refuse(asker, number, "absent", "nobody offers it")
         elif question:
@@ -135,17 +134,17 @@ class RemoteLookups:
         MalformedMessageError
             If no question had this number; an answer to a question that was given up is ignored.
         """
-        number = int.from_bytes(data[:_NUMBER], "little")
+        number = int.from_bytes(data[:NUMBER], "little")
         if not self._first < number <= self._number:
             raise MalformedMessageError("lookup", "an answer to a question that was never asked")
         pending = self._pending.get(number)
-        if pending is not None and pending.peer == peer and len(data) > _NUMBER:
-            pending.answer = data[_NUMBER:]
+        if pending is not None and pending.peer == peer and len(data) > NUMBER:
+            pending.answer = data[NUMBER:]
             pending.done.set()
 
     def put(self, kind: Kind, link: str, number: int, body: bytes) -> bool:
         """Send a question or an answer to a link; returns False if it is known not to arrive."""
-        return self._send(link, write_body(kind, number.to_bytes(_NUMBER, "little") + body))
+        return self._send(link, write_body(kind, number.to_bytes(NUMBER, "little") + body))
 
     def refuse(self, asker: str, number: int, reason: str, detail: str) -> None:
         """Send an answer that refuses a question."""

@@ -31,7 +31,7 @@ For bytes with any of these, they raise one kind of error each.
 import enum
 import json
 import struct
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from sys import intern
 from typing import Any, NamedTuple, TypeVar
@@ -62,7 +62,7 @@ from tfbus.links.replica import (
 )
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
-from tfbus.tf_message import MAX_NAME, MalformedMessageError, decode_in_parts, encode, refusal
+from tfbus.tf_message import MAX_NAME, Decoded, MalformedMessageError, decode, decode_in_parts, encode, refusal
 from tfbus.uncertainty.answers import UncertainTransform
 
 VERSION = 7
@@ -86,8 +86,8 @@ _BELIEFS_AT_ONCE = 50
 _LONGEST_AUTHORITY = 65_535
 FIRST_STAMP, END_OF_STAMPS = -(2**31) * SECOND, 2**31 * SECOND
 _MOST_DIGITS = 20
-_BEFORE_TEXT = 10
-"""The bytes before the JSON of a lookup: version, kind and number."""
+NUMBER = 8
+"""Bytes of the number before the question or answer of a lookup."""
 _SHOWN = 200
 
 _ARGUMENT_ERRORS: dict[str, type[Exception]] = {"TypeError": TypeError, "ValueError": ValueError}
@@ -346,7 +346,8 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
     if kind is None:
         raise MalformedMessageError("version", f"expected a message of version {VERSION}, got {data[:2]!r}")
     if kind in TEXTS:
-        if len(data) > MAX_TEXT + _BEFORE_TEXT:
+        # Version and kind, and the number of a lookup, are before the JSON.
+        if len(data) > MAX_TEXT + 2 + NUMBER:
             raise MalformedMessageError("oversized", f"a text of {len(data)} bytes, more than {MAX_TEXT}")
         yield Text(kind, data[2:])
         return
@@ -361,7 +362,13 @@ def read_message(data: bytes) -> Iterator[Heard | Text | None]:
         raise MalformedMessageError("head", "a name in a message is no UTF-8") from None
     samples: list[FromLink | None] = []
     if tags or end < len(data):
-        for decoded in decode_in_parts(data[end:], _PART, ReceivedTransform, tags=tags):
+        payload = data[end:]
+        parts: Iterable[Decoded[ReceivedTransform]]
+        if len(tags) <= _PART:
+            parts = [decode(payload, tags, ReceivedTransform)]
+        else:
+            parts = decode_in_parts(payload, _PART, ReceivedTransform, tags=tags)
+        for decoded in parts:
             if samples:
                 yield None
             samples += decoded.samples
