@@ -387,6 +387,21 @@ async def test_what_no_message_can_hold_is_counted_and_logged_and_the_rest_goes_
     assert sum("not sent over the link tf" in message for message in caplog.messages) <= 6
 
 
+async def test_a_newest_sample_that_no_message_can_hold_hides_nothing_from_who_joins_later() -> None:
+    network = MemoryNetwork()
+    with Bus(max_ahead=None) as here, Buffer(here), Bus() as there, Buffer(there) as buffer:
+        async with DomainLink(here, "tf", network.wire()):
+            for stamp in (1, 2**62):
+                here.publish([static("map", "post", stamp=stamp), moving("map", "arm", stamp)])
+            here.publish([moving("map", "base", stamp) for stamp in (1, 2, 3)])
+            here.publish([static("map", f"post {n}") for n in range(600)])
+            await settle()
+            async with DomainLink(there, "tf", network.wire(), history=5.0):
+                await until(lambda: there.statistics().frames == 603)
+                assert buffer.lookup_nowait("map", "arm").stamp == 1
+                await buffer.lookup("map", "base", 2, timeout=3.0)
+
+
 async def test_what_the_wire_warns_of_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     wire = LoggedWire(MemoryNetwork())
     with Bus() as bus:

@@ -379,9 +379,12 @@ class Relay:
                 known = entries.get(child)
                 # A link has noted what it brings.
                 if known is None or known.source is not source or source.outbox is None:
-                    route = self._route if can_hold(sample) else ()
-                    self.replica.note(child, source, sample, route, settles=not sample.static)
-                    known = entries[child]
+                    fits = can_hold(sample)
+                    # Other buses keep the last sample that a message can hold, and this copy keeps it for them.
+                    if known is None or fits or not known.views:
+                        route = self._route if fits else ()
+                        self.replica.note(child, source, sample, route, settles=not sample.static)
+                        known = entries[child]
                 if self._remembers:
                     _remember(known, sample)
                 # A sample of another bus that is late does not make the frame its own.
