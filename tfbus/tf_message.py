@@ -341,22 +341,23 @@ def _normalised(row: Row) -> Row | None:
 
 def _new_names(piece: bytes, layout: _Layout, bare: bool) -> tuple[str, str] | None:
     """The two names of a piece; None if they cannot be the frames of a sample."""
-    parent, child = (_name(text, bare) for text in _split_names(piece, layout))
+    texts = _split_names(piece, layout)
+    parent, child = _name(texts[0], bare), _name(texts[1], bare)
     if parent is None or child is None or parent == child or not (is_frame(parent) and is_frame(child)):
         return None
     return parent, child
 
 
-def _split_names(piece: bytes, layout: _Layout) -> Iterator[bytes]:
+def _split_names(piece: bytes, layout: _Layout) -> tuple[bytes, bytes]:
     """The two strings of a piece without the NUL at their ends."""
-    at = 0
-    for _ in range(2):
-        (length,) = layout.size.unpack_from(piece, at)
-        text = piece[at + 4 : at + 4 + length]
-        if not text.endswith(b"\0"):
-            raise MalformedMessageError("text", f"the string {text[:_SHOWN]!r} does not end with NUL")
-        yield text[:-1]
-        at += 4 + length + 3 & -4
+    (length,) = layout.size.unpack_from(piece)
+    middle = 4 + length + 3 & -4
+    (second,) = layout.size.unpack_from(piece, middle)
+    parent, child = piece[4 : 4 + length], piece[middle + 4 : middle + 4 + second]
+    if parent.endswith(b"\0") and child.endswith(b"\0"):
+        return parent[:-1], child[:-1]
+    wrong = child if parent.endswith(b"\0") else parent
+    raise MalformedMessageError("text", f"the string {wrong[:_SHOWN]!r} does not end with NUL")
 
 
 def _name(text: bytes, bare: bool) -> str | None:

@@ -71,9 +71,9 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
-from itertools import groupby, islice
+from itertools import groupby
 from math import inf
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from random import uniform
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -364,8 +364,10 @@ class Replica:
         # Frames whose entries have changed since the last claim and are to settle first.
         self._fresh: dict[str, None] = {}
         self._unsettled: dict[str, float] = {}
-        # The changes in their order; a frame that has changed again since has a higher sequence.
-        self._log: list[tuple[int, Known]] = []
+        # The changes in their order, and their sequences; a frame that has changed again since has a higher one. A list
+        # of pairs would give the garbage collector one more object for each frame.
+        self._log: list[Known] = []
+        self._sequences: list[int] = []
 
     def note(
         self,
@@ -456,7 +458,7 @@ class Replica:
 
     def widen(self, known: Known, views: "Iterable[View]") -> None:
         """Let an entry be in some views too."""
-        new = tuple(view for view in views if view not in known.views and view.holds(known.frame))
+        new = (*[view for view in views if view not in known.views and view.holds(known.frame)],)
         if new:
             # Most entries share the tuple of their route, for the garbage collector looks at each.
             is_route = not known.views and new == known.route
@@ -489,8 +491,9 @@ class Replica:
             # Numbered now for the order of this answer, and again when it settles, for the links without this answer.
             if not self.entries[frame].sequence:
                 self._number(self.entries[frame])
-        log = islice(self._log, bisect_right(self._log, since, key=itemgetter(0)), None)
-        return (known for sequence, known in log if known.sequence == sequence)
+        log, sequences = self._log, self._sequences
+        places = range(bisect_right(sequences, since), len(log))
+        return (log[place] for place in places if log[place].sequence == sequences[place])
 
     def settle(self, now: float) -> None:
         """Number the settled changes, and take the unsettled ones out of the digests."""
@@ -540,9 +543,12 @@ class Replica:
     def _number(self, known: Known, settled: bool = False) -> None:
         self.sequence += 1
         known.sequence = self.sequence
-        self._log.append((self.sequence, known))
+        self._log.append(known)
+        self._sequences.append(self.sequence)
         if len(self._log) > 2 * len(self.entries) + _SPARE:
-            self._log = [(number, known) for number, known in self._log if known.sequence == number]
+            log = zip(self._log, self._sequences, strict=True)
+            self._log = [known for known, sequence in log if known.sequence == sequence]
+            self._sequences = [known.sequence for known in self._log]
         if settled:
             rank = b"%b%d %d " % (known.source.origin, known.source.sequence, known.sample is None)
             digest = hash_bytes(rank + known.frame.encode("utf-8", "surrogatepass"), 8)
