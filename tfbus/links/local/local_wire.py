@@ -206,15 +206,16 @@ class LocalWire(Wire):
 
     def _look(self, younger: bool = False) -> None:
         """Connect to the older links that are not met, or to all, and show this link's name unless it is there."""
-        if self._listener is None or self._place.name not in self._place.names():
+        names = self._place.names()
+        if self._listener is None or self._place.name not in names:
             listener = self._place.open()
             self._stop_listening()
-            self._listener = listener
+            self._listener, names = listener, self._place.names()
         # Again, because there may be free files after there were none.
         self._poll.watch(self._listener, self._listener, EVENT_READ)
         # A name ends with the beginning of the id.
         known = {self.id[:8], *(each.dialled[-8:] or each.link[:8] for each in self._connections)}
-        for name in self._place.names():
+        for name in names:
             if name[-8:] not in known and (younger or name < self._place.name) and not self._is_full():
                 self._dial(name)
 
