@@ -206,7 +206,8 @@ class LocalWire(Wire):
 
     def _look(self, younger: bool = False) -> None:
         """Connect to the older links that are not met, or to all, and show this link's name unless it is there."""
-        names = self._place.names()
+        # The directory is trusted once it has been opened.
+        names = [] if self._listener is None else self._place.names()
         if self._listener is None or self._place.name not in names:
             listener = self._place.open()
             self._stop_listening()
