@@ -30,7 +30,6 @@ BACKLOG: Final = 1024
 LONGEST_PATH: Final = 100
 """Bytes; systems have room for 104 to 108 in the address of a Unix socket."""
 SEND_BUFFER: Final = 2**18
-_GONE = FileNotFoundError, NotADirectoryError, PermissionError
 _OTHERWISE = "or set TFBUS_RUNTIME_DIR to a directory of your own"
 
 
@@ -145,9 +144,9 @@ class MeetingPlace:
         return listener
 
     def names(self) -> list[str]:
-        """The names of all links, and of this one unless somebody has removed it or the directory; raises `OSError`."""
+        """The names of all links, and of this one unless somebody has removed it; none if the directory has gone."""
         # Every link looks again and again, and a path for each file would take half of its work at rest.
-        with suppress(*_GONE), os.scandir(self._directory) as files:
+        with suppress(OSError), os.scandir(self._directory) as files:
             return [file.name for file in files if self._is_name(file.name)]
         return []
 
