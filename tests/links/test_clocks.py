@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from support.domains import SECOND, Network, Process, SkewedClock, World
 from support.foreign_world import ForeignWorld
-from support.samples import moving
+from support.samples import moving, static
 
 from tfbus import (
     Buffer,
@@ -269,6 +269,26 @@ def test_a_joiner_is_told_the_newest_samples_and_the_past_by_another_bus_and_cor
             for sample in corrected:
                 assert sample.stamp / SECOND == pytest.approx(sample.transform.translation[0], abs=0.002)
             world.kill(late)
+
+
+def test_frames_of_one_batch_that_rest_are_all_corrected_and_stay() -> None:
+    world = World()
+    network = Network(world)
+    network.delay = lambda *_: 0.0004
+    clock = SkewedClock(world, 7.0)
+    there = world.process(network, clock=clock)
+    said = [moving("map", name, clock.now()) for name in ("arm", "hand", "tool")]
+    there.say(static("map", "camera"), *said)
+    began = world.now
+    here = world.process(network, clock=SkewedClock(world), correct_clocks=True)
+    world.run(5.0)
+    for sample in said:
+        assert here.frames[sample.child].stamp == pytest.approx(began * SECOND, abs=2_000_000)
+    # Others are told the stamps that the sender gave.
+    world.kill(there)
+    late = world.process(network, clock=SkewedClock(world))
+    world.run(3.0)
+    assert {sample.child: sample.stamp for sample in said} == {s.child: late.frames[s.child].stamp for s in said}
 
 
 @pytest.mark.parametrize("step", [1.0, -1.0, 0.03])

@@ -42,6 +42,7 @@ from tfbus.links.replica import (
     Claim,
     Entry,
     FromLink,
+    Known,
     Provenance,
     ReceivedBatch,
     RemovedFrame,
@@ -451,17 +452,22 @@ class DomainEnd(Endpoint):
         if peer.is_placed or not self.clocks.is_measured(peer.id):
             return
         peer.is_placed = True
-        for known in list(self.relay.replica.entries.values()):
+        waiting: dict[Provenance, list[tuple[Known, FromLink]]] = {}
+        for known in self.relay.replica.entries.values():
             source, sample = known.source, known.sample
-            if source.peer is not peer or source.clock is not None or not isinstance(sample, FromLink):
-                continue
-            # Others may hold the sample as it came. It has no source yet if the bus had it from elsewhere.
-            moved = sample.again(source)
-            self._correct(peer, source, () if sample.static else (moved,))
-            if source.shift and not sample.static:
-                known.sample = moved
-                if known.shown is not None and not self.bus.closed:
-                    self.relay.remove(known.frame, None)
+            if source.peer is peer and source.clock is None and isinstance(sample, FromLink):
+                waiting.setdefault(source, []).append((known, sample))
+        moved: list[Known] = []
+        for source, together in waiting.items():
+            # Others may hold the samples as they came. They have no source yet if the bus had them from elsewhere.
+            moving = [(known, sample.again(source)) for known, sample in together if not sample.static]
+            self._correct(peer, source, [sample for _, sample in moving])
+            for known, sample in moving if source.shift else ():
+                known.sample = sample
+                moved.append(known)
+        for known in moved:
+            if known.shown is not None and not self.bus.closed:
+                self.relay.remove(known.frame, None)
         if self.clocks.corrects and peer.rate:
             self._history.joined(peer.id)
         if self.clocks.corrects and not self._history.open:
