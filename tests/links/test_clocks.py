@@ -271,7 +271,8 @@ def test_a_joiner_is_told_the_newest_samples_and_the_past_by_another_bus_and_cor
             world.kill(late)
 
 
-def test_frames_of_one_batch_that_rest_are_all_corrected_and_stay() -> None:
+@pytest.mark.parametrize("others_move", [False, True])
+def test_frames_of_one_batch_that_rest_are_all_corrected_and_stay(others_move: bool) -> None:
     world = World()
     network = Network(world)
     network.delay = lambda *_: 0.0004
@@ -281,7 +282,10 @@ def test_frames_of_one_batch_that_rest_are_all_corrected_and_stay() -> None:
     there.say(static("map", "camera"), *said)
     began = world.now
     here = world.process(network, clock=SkewedClock(world), correct_clocks=True)
-    world.run(5.0)
+    for _ in range(50):
+        if others_move:
+            publish(there, "cart", clock)
+        world.run(0.1)
     for sample in said:
         assert here.frames[sample.child].stamp == pytest.approx(began * SECOND, abs=2_000_000)
     # Others are told the stamps that the sender gave.

@@ -440,6 +440,10 @@ class Clocks:
         before.step = step if abs(step) > limit else 0
         return abs(moved) > limit if self.corrects else bool(before.step)
 
+    def forget_origins(self, link: str) -> None:
+        """Follow the clocks of the buses that a peer brings anew, with its next batches."""
+        self._origins = {origin: known for origin, known in self._origins.items() if known.link != link}
+
     def step_of(self, origin: bytes) -> int:
         """The step of the clock of a bus between its last two live batches, in ns."""
         return self._origins[origin].step
