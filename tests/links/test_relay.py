@@ -18,8 +18,8 @@ from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, PeerLost, SimulatedClock, TransformStamped
 from tfbus.links.message import Kind
-from tfbus.links.relay import MOST_PASSED
-from tfbus.links.replica import OutgoingBatch, ReceivedTransform, RemovedFrame, Replica
+from tfbus.links.relay import MOST_PASSED, relay_of
+from tfbus.links.replica import MOST_REMOVALS, OutgoingBatch, ReceivedTransform, RemovedFrame, Replica
 from tfbus.tf_message import decode, encode
 
 Graph = Sequence[Sequence[int]]
@@ -273,6 +273,23 @@ def test_what_a_lost_bus_has_said_does_not_take_a_frame_over_when_it_is_late_and
         bridge.say(kind=Kind.SIGN, reach=[(old.bus, ())])
     bridge.say(said)
     assert len(listener.seen) == 2
+
+
+def test_a_removal_that_all_buses_of_a_ring_forget_goes_round_once() -> None:
+    world, (one, *_, last) = domains(GRAPHS["ring"])
+    one.say(static("map", "old"))
+    known = relay_of(one.bus).replica.entries["old"].source.sequence
+    stranger = Stranger(one.networks[0])
+    for first in range(0, MOST_REMOVALS, MOST_REMOVALS // 4):
+        later = range(first, first + MOST_REMOVALS // 4)
+        stranger.say(*(stranger.removal(f"{number}", known + 100 + number) for number in later))
+    world.run(10.0)
+    for network in one.networks:
+        network.sent()
+    stranger.say(stranger.removal("old", known + 1), stranger.removal("unknown", known + 2))
+    world.run(10.0)
+    assert last.frames == {}
+    assert sum(network.sent(Kind.LIVE) for network in one.networks) < 20
 
 
 @pytest.mark.thorough

@@ -495,7 +495,11 @@ class DomainEnd(Endpoint):
 
     def _remove(self, view: View, source: Provenance, frame: str) -> bool:
         """Note a removal; returns whether it was news for the map."""
-        is_news = view.holds(frame) and self.relay.replica.note(frame, source, None, view.route)
+        replica = self.relay.replica
+        was_known = frame in replica.entries
+        is_news = view.holds(frame) and replica.note(frame, source, None, view.route)
+        # One that is forgotten at once is news only where the frame is, or it would go round in a ring of buses for ever.
+        is_news = is_news and (was_known or frame in replica.entries)
         if is_news:
             self.relay.remove(frame, source)
         return is_news
