@@ -402,6 +402,12 @@ def test_an_answer_about_the_past_that_nobody_has_asked_for_changes_nothing() ->
 # Ways
 
 
+def test_a_peer_leads_to_one_bus_and_to_those_in_its_signs_whatever_buses_it_names(scene: Scene) -> None:
+    for number in range(100):
+        scene.stranger.say_bytes(write_message(Outgoing(Kind.LIVE, b"%16d" % number, number + 1)))
+    assert len(list(scene.process.end.ways())) == 1
+
+
 def test_a_bus_that_a_peer_says_it_reaches_is_there_while_it_says_so() -> None:
     scene = Scene(drop_lost=True)
     far, own = b"a bus far away..", scene.origin

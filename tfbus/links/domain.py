@@ -621,10 +621,10 @@ class DomainEnd(Endpoint):
         if heard.kind in (Kind.SIGN, Kind.MEETING):
             told = {bus: (heard.bus, *path) for bus, path in heard.reach if bus != own and own not in path}
             paths = {heard.bus: (), **{bus: path for bus, path in told.items() if bus != heard.bus}}
-        elif heard.bus in peer.paths:
+        elif peer.paths:
             return
         else:
-            paths = {**peer.paths, heard.bus: ()}
+            paths = {heard.bus: ()}
         paths.pop(own, None)
         if paths == peer.paths:
             return
