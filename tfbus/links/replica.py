@@ -345,7 +345,7 @@ class Replica:
     Attributes
     ----------
     origin : bytes
-        The name of the bus for others: 16 random bytes. Its own frames are not counted.
+        The name of the bus for others: 16 random bytes.
     entries : dict of str to Known
     sequence : int
         The number of the newest change.
@@ -355,7 +355,7 @@ class Replica:
         self.origin = os.urandom(16)
         self.entries: dict[str, Known] = {}
         self.sequence = 0
-        # How many frames each other origin has.
+        # How many frames each origin has, this bus too: a stranger may speak in its name.
         self._held: Counter[bytes] = Counter()
         # Their sum, because a peer may tell of as many origins as frames.
         self._taken = 0
@@ -388,7 +388,7 @@ class Replica:
         route : tuple of View
             The views to which this brings the frame.
         max_frames : float
-            How many frames one origin may have, but for the own one.
+            How many frames one origin may have.
         settles : bool
             Whether the entry may change again in a moment: it is a live sample of a moving frame.
 
@@ -518,8 +518,9 @@ class Replica:
 
     def _admit(self, origin: bytes, known: Known | None, sample: TransformStamped | None, max_frames: float) -> None:
         """Count a new entry in place of a known one."""
-        if sample is not None and origin != self.origin:
-            if self._held[origin] >= max_frames or self._taken >= MANY_ORIGINS * max_frames:
+        if sample is not None:
+            taken = self._taken - self._held[self.origin]
+            if self._held[origin] >= max_frames or taken >= MANY_ORIGINS * max_frames:
                 raise TooManyEntriesError(f"the peer has announced more than {max_frames} frames")
             self._held[origin] += 1
             self._taken += 1
@@ -531,7 +532,7 @@ class Replica:
         origin = known.source.origin
         if known.sample is None:
             del self._removals[bisect_left(self._removals, (known.source.rank, known.frame))]
-        elif origin != self.origin:
+        else:
             self._held[origin] -= 1
             self._taken -= 1
             if not self._held[origin]:
