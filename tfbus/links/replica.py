@@ -512,9 +512,16 @@ class Replica:
     def _replaces(source: Provenance, sample: TransformStamped | None, known: Known) -> bool:
         if source.sequence != known.source.sequence or source.origin != known.source.origin:
             return source.rank > known.source.rank
-        # Two samples of one batch, by the stamps that its sender gave them.
-        shift = source.shift - known.source.shift
-        return sample is not None and known.sample is not None and sample.stamp - shift > known.sample.stamp
+        before = known.sample
+        if sample is None or before is None:
+            return False
+        if not (sample.static or before.static):
+            # Two moving samples of one batch, by the stamps that its sender gave them.
+            newer = (sample.stamp - source.shift) - (before.stamp - known.source.shift)
+            if newer:
+                return newer > 0
+        # Otherwise the last one of the batch holds, as on its own bus; the same one again is not new.
+        return (sample.parent, sample._row, sample.static) != (before.parent, before._row, before.static)
 
     def _admit(self, origin: bytes, known: Known | None, sample: TransformStamped | None, max_frames: float) -> None:
         """Count a new entry in place of a known one."""
