@@ -134,6 +134,15 @@ def test_the_past_comes_in_chunks_of_whole_frames_in_order_and_is_bounded() -> N
     assert sum(kind is Kind.PAST for kind, _ in network.carried) == 4
 
 
+def test_a_sample_that_no_message_can_hold_keeps_none_of_the_past_from_late_joiners() -> None:
+    world, network, teller, _ = scene()
+    teller.say(*(moving("map", name, second * SECOND) for name in "ac" for second in range(5)))
+    teller.say(moving("map", "b", SECOND), moving("x" * 2_000, "b", 2 * SECOND), moving("map", "b", 3 * SECOND))
+    late = world.process(network, history=60.0)
+    world.run(5.0)
+    assert [stamps_of(late.seen, name) for name in "abc"] == [[0, 1, 2, 3, 4], [1, 3], [0, 1, 2, 3, 4]]
+
+
 def test_a_peer_is_asked_once_even_if_it_comes_back() -> None:
     world, network, teller, _ = scene()
     teller.say(moving("map", "base", SECOND))

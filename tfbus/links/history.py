@@ -12,7 +12,7 @@ from math import inf
 from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import SeenKeys
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links.message import Heard, Kind, PastQuestion, write_body, write_question
+from tfbus.links.message import Heard, Kind, PastQuestion, can_hold, write_body, write_question
 from tfbus.links.replica import Known, OutgoingBatch, ReceivedBatch
 from tfbus.stamps import from_seconds
 from tfbus.tree.history import samples_of
@@ -62,7 +62,7 @@ def chunk_of_past(bus: Bus, brought: Iterable[Known], seconds: float, after: str
 
 
 def _recent(bus: Bus, frame: str, seconds: float) -> list[TransformStamped]:
-    """The newest samples of a frame, of the buffer that holds the longest history of it."""
+    """The newest samples of a frame that a message can hold, of the buffer that holds the longest history of it."""
     held = (live.forest.frames.get(frame) for live in bus._trees)
     histories = [history for history in held if history is not None and history.oldest is not None]
     if not histories:
@@ -72,7 +72,7 @@ def _recent(bus: Bus, frame: str, seconds: float) -> list[TransformStamped]:
     low = newest - from_seconds(seconds)
     stamps = history.samples_between(low, newest).stamps[-MOST_OF_FRAME:]
     low = max(low, int(stamps[0]))
-    return [sample for sample in samples_of(history, low, newest) if sample.stamp >= low]
+    return [sample for sample in samples_of(history, low, newest) if sample.stamp >= low and can_hold(sample)]
 
 
 @dataclass(slots=True)
