@@ -11,9 +11,10 @@ from tfbus import Bus, TransformStamped
 from tfbus.links import DomainLink
 from tfbus.links.channels import LONGEST_FILTER, MOST_FILTERS, filter_name
 from tfbus.links.domain import MOST_ROBOTS
-from tfbus.links.message import Heard, Kind, read_message
+from tfbus.links.message import Heard, Kind, Outgoing, read_message, write_message
 from tfbus.links.relay import relay_of
 from tfbus.links.replica import ReceivedBatch
+from tfbus.links.seams import Received
 
 
 @pytest.fixture
@@ -161,6 +162,25 @@ def test_of_a_slow_robot_come_static_frames_at_once_and_the_newest_of_moving_one
     world.run(5.0)
     assert "base" not in slow.frames
     assert slow.end.lost == 0
+
+
+def test_a_message_of_newest_samples_is_taken_or_left_out_as_a_whole_however_long_its_parts_take() -> None:
+    world = World()
+    network = Network(world)
+    board = world.process(network, robots={"*": 0.5})
+    robot = Stranger(network, robot="r1")
+    world.run(1.0)
+    for second in range(5):
+        entries = [robot.batch(moving("map", f"{n}", second), number=second + 1) for n in range(1_000)]
+        message = write_message(Outgoing(Kind.LIVE, robot.bus), entries)
+        for part in board.end.split(Received(robot.id, message)):
+            if part is not None:
+                board.end.handle(robot.id, part)
+            # Other tasks have their turn.
+            world.now += 0.03
+        world.run(0.8)
+    assert set(counts(board).values()) == {3}
+    assert len(board.frames) == 1_000
 
 
 def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer(world: World, network: Network) -> None:

@@ -219,6 +219,9 @@ class DomainEnd(Endpoint):
             yield item.content
             return
         for part in read_message(item.content):
+            # A message that comes before its time is left out as a whole, however long its parts take.
+            if isinstance(part, Heard) and not part.continues and self._is_thinned(item.sender, part):
+                return
             yield part
             # Only a sign without a time may rest, because a clock may be followed later.
             is_plain = isinstance(part, Heard) and part.kind is Kind.SIGN and part.time is None
@@ -346,8 +349,6 @@ class DomainEnd(Endpoint):
     def _take_message(self, sender: str, heard: Heard) -> None:
         peer = self.peers.get(sender)
         if peer is None or not peer.present or self.bus.closed:
-            return
-        if heard.kind is Kind.LIVE and self._is_thinned(peer, heard):
             return
         if heard.time is not None:
             self._hear_time(sender, heard.time)
@@ -573,15 +574,18 @@ class DomainEnd(Endpoint):
             self.lost += missing
         return known and missing > 0
 
-    def _is_thinned(self, peer: Peer, heard: Heard) -> bool:
+    def _is_thinned(self, sender: str, heard: Heard) -> bool:
         """Whether a message with newest samples comes before its time."""
-        if heard.number or peer.rate == inf:
+        if heard.number or heard.kind is not Kind.LIVE:
+            return False
+        peer = self.peers.get(sender)
+        if peer is None or peer.rate == inf:
             return False
         now = self._now()
         since = now - peer.thinned
         # Samples that belong together come in several messages at once.
         if since > 0.02:
-            if since < 0.9 / peer.rate:
+            if since * peer.rate < 0.9:
                 return True
             peer.thinned = now
         return False
