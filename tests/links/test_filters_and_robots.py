@@ -112,6 +112,22 @@ def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_th
     assert counts(long) == {"f0": 3}
 
 
+@pytest.mark.parametrize("letter", ["я", "框", "\udc80", '"'])
+def test_the_names_of_a_filter_may_be_in_any_script(letter: str) -> None:
+    world = World()
+    network = Network(world)
+    one = world.process(network)
+    size = len((letter * 18).encode("utf-8", "surrogatepass")) + len("1234,")
+    frames = [f"{number}{letter * 18}" for number in range(LONGEST_FILTER // size - 1)]
+    some = world.process(network, frames=[*frames, "plain"])
+    one.say(static("map", "plain"))
+    world.run(1.0)
+    one.say(static("map", frames[0]), moving("map", "plain", 1))
+    world.run(1.0)
+    assert counts(some)["plain"] == 2
+    assert (frames[0] in some.frames) == (letter != "\udc80"), "no message can hold half of a letter"
+
+
 def test_a_link_for_no_frame_at_all_hears_and_sends_nothing(world: World, network: Network) -> None:
     one, none = world.process(network), world.process(network, frames=[])
     one.say(static("map", "a"), moving("map", "b", 1))
