@@ -13,7 +13,7 @@ from tfbus.links.channels import LONGEST_FILTER, MOST_FILTERS, filter_name
 from tfbus.links.domain import MOST_ROBOTS
 from tfbus.links.message import Heard, Kind, Outgoing, read_message, write_message
 from tfbus.links.relay import relay_of
-from tfbus.links.replica import ReceivedBatch
+from tfbus.links.replica import CHUNK, ReceivedBatch
 from tfbus.links.seams import Received
 
 
@@ -110,6 +110,19 @@ def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_th
         assert [sample.stamp for sample in samples if sample.child == f"f{number}"] == [0, 1, 2]
         assert len(samples) == (3 if number < MOST_FILTERS else 3 * len(many))
     assert counts(long) == {"f0": 3}
+
+
+def test_who_meets_a_link_with_names_that_are_too_long_has_its_static_frames_soon(
+    world: World, network: Network
+) -> None:
+    frames = [f"{number}{'x' * 150}" for number in range(CHUNK + 1)]
+    world.process(network, robot="r1")
+    some = world.process(network, robot="r2", frames=frames)
+    some.say(*(static("map", frame) for frame in frames))
+    world.run(5.0)
+    late = world.process(network)
+    world.run(10.0)
+    assert late.frames.keys() == set(frames)
 
 
 @pytest.mark.parametrize("letter", ["я", "框", "\udc80", '"'])

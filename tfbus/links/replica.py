@@ -732,7 +732,7 @@ class Agreement:
     def told(self, peer: str, claim: Claim, now: float, soon: bool = False) -> None:
         """Take the claim in a sign of a peer; with `soon`, ask for missing entries at once."""
         copy = self._copies.get(peer)
-        if copy is None or (claim.partial and copy.frames is None):
+        if copy is None:
             return
         if copy.claim is not None and claim.sequence < copy.claim.sequence:
             return
