@@ -502,7 +502,7 @@ class DomainEnd(Endpoint):
         replica = self.relay.replica
         was_known = frame in replica.entries
         is_news = view.holds(frame) and replica.note(frame, source, None, view.route)
-        # One that is forgotten at once is news only where the frame is, or it would go round in a ring of buses for ever.
+        # One that is forgotten at once is news only where the frame is, or it would go round in a ring of buses.
         is_news = is_news and (was_known or frame in replica.entries)
         if is_news:
             self.relay.remove(frame, source)
