@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import strategies as some
-from support.domains import Network, Process, Stranger, World, agree
+from support.domains import Network, Process, Stranger, World, agree, finish
 from support.foreign_world import ForeignTransform, ForeignWorld
 from support.processes import peak_of
 from support.samples import moving, static
@@ -323,6 +323,20 @@ def test_an_ended_link_forgets_and_its_bus_can_go_on_or_close() -> None:
     two.bus.close()
     world.run(5.0)
     assert two.end.rejected == {}
+
+
+def test_when_one_of_two_links_ends_what_it_brought_stays_and_the_other_leads_there_no_more() -> None:
+    world, (one, bridge, other) = domains([[0, 1], [1, 2]], drop_lost=True)
+    one.say(static("map", "a"))
+    world.run(1.0)
+    ended = bridge.ends.pop(0)
+    ended.detach()
+    ended.send()
+    finish(ended.network.close())
+    world.run(10.0)
+    world.process(other.networks[0])
+    world.run(10.0)
+    assert (set(bridge.frames), set(other.frames)) == ({"a"}, set())
 
 
 # Samples that came over a link

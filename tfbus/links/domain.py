@@ -178,8 +178,8 @@ class DomainEnd(Endpoint):
 
     def detach(self) -> None:
         self.lookups.close()
-        for peer in list(self.peers.values()):
-            self._forget(peer)
+        while self.peers:
+            self._forget(self.peers.popitem()[1])
         self.relay.detach(self)
 
     def work(self) -> float:
