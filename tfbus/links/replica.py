@@ -655,6 +655,8 @@ class _Copy:
         Whether the question is not put off.
     missed : bool
         Whether live messages are missing.
+    fetches : bool
+        Whether the last answer was not the whole one.
     fruitless, silences : int
         Answers without news, and questions without an answer, one after the other.
     differs : int
@@ -671,6 +673,7 @@ class _Copy:
     again: float = inf
     urgent: bool = False
     missed: bool = False
+    fetches: bool = False
     fruitless: int = 0
     silences: int = 0
     differs: int = 0
@@ -687,15 +690,9 @@ class Agreement:
     """Decides which peer a link asks next, so that its copies come to agree with the copies of its peers; see above.
 
     Nothing here knows an event loop: the caller hands in each time, in s of a monotonic clock.
-
-    Attributes
-    ----------
-    fetches : bool
-        Whether a peer tells its copy in several answers, and the last one has not come yet.
     """
 
     def __init__(self) -> None:
-        self.fetches: bool = False
         self._copies: dict[str, _Copy] = {}
         self._remembered: dict[str, tuple[View, int]] = {}
         self._asked: Question | None = None
@@ -703,6 +700,11 @@ class Agreement:
         # The time at which one of the questions that were put off is asked.
         self._latest = inf
         self._is_new = True
+
+    @property
+    def fetches(self) -> bool:
+        """Whether a peer tells its copy in several answers, and the last one has not come yet."""
+        return any(copy.fetches for copy in self._copies.values())
 
     def joined(self, peer: str, view: View, now: float, must_ask: bool = False) -> None:
         """Begin to follow the copy of a peer; it has to be asked if this is the first one, or if the caller says so."""
@@ -726,7 +728,7 @@ class Agreement:
             if len(self._remembered) > MOST_REMEMBERED:
                 del self._remembered[next(iter(self._remembered))]
         if self._asked is not None and self._asked.peer == peer:
-            self._asked, self.fetches = None, False
+            self._asked = None
             self._is_new = self._is_new or not any(other.seen for other in self._copies.values())
 
     def told(self, peer: str, claim: Claim, now: float, soon: bool = False) -> None:
@@ -743,7 +745,7 @@ class Agreement:
             copy.silences = 0
             copy.due = min(copy.due, now + uniform(0.05, 0.2))
         if not copy.missed and self._agrees(copy, now):
-            copy.seen, copy.due, copy.fruitless = claim.sequence, inf, 0
+            copy.seen, copy.due, copy.fruitless, copy.fetches = claim.sequence, inf, 0, False
         elif claim.sequence > copy.seen:
             if not claim.final:
                 # Most of what the peer still fetches is here. Its next sign comes soon, unless the fetching never ends.
@@ -771,7 +773,7 @@ class Agreement:
             # An answer that leads nowhere.
             self._fail(copy, now)
             return
-        self.fetches = not claim.final
+        copy.fetches = not claim.final
         copy.seen = claim.sequence
         copy.due, copy.urgent = now, True
         copy.again = now + _ASK_AGAIN if copy.must_ask else inf
@@ -820,6 +822,7 @@ class Agreement:
                 self._asked, self._patience = Question(peer, copy.seen), now + PATIENCE
                 return self._asked
             copy.seen = max(copy.seen, 0 if copy.claim is None else copy.claim.sequence)
+            copy.fetches = False
 
     def rests(self, peer: str, now: float) -> bool:
         """Whether the copies agree and no question to a peer is open, so that the same sign again needs no work."""
@@ -846,7 +849,7 @@ class Agreement:
         return claim.digest ^ copy.view.claim(now, copy.frames).digest
 
     def _fail(self, copy: _Copy, now: float) -> None:
-        self.fetches = False
+        copy.fetches = False
         copy.silences = min(copy.silences + 1, 10)
         copy.missed = True
         longest = _LONGEST_PAUSE
