@@ -295,6 +295,24 @@ def test_frames_of_one_batch_that_rest_are_all_corrected_and_stay(others_move: b
     assert {sample.child: sample.stamp for sample in said} == {s.child: late.frames[s.child].stamp for s in said}
 
 
+def test_a_frame_that_came_by_a_bridge_before_any_clock_was_known_begins_anew_with_its_next_sample() -> None:
+    world = World()
+    first, second = Network(world), Network(world)
+    first.delay = second.delay = lambda *_: 0.0004
+    clock = SkewedClock(world, 7.0)
+    here = world.process(first, clock=SkewedClock(world), correct_clocks=True)
+    world.process(first, second, clock=SkewedClock(world))
+    there = world.process(second, clock=clock)
+    with Buffer(here.bus) as buffer:
+        world.run(0.01)
+        publish(there, "cart", clock)
+        world.run(5.0)
+        publish(there, "cart", clock)
+        world.run(1.0)
+        (edge,) = buffer.tree.edges()
+        assert edge.oldest == edge.newest == pytest.approx((world.now - 1.0) * SECOND, abs=2_000_000)
+
+
 @pytest.mark.parametrize("step", [1.0, -1.0, 0.03])
 @pytest.mark.parametrize("corrects", [False, True])
 def test_a_clock_that_is_set_is_noticed_at_once_and_nothing_is_interpolated_across(step: float, corrects: bool) -> None:

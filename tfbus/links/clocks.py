@@ -441,8 +441,9 @@ class Clocks:
         return abs(moved) > limit if self.corrects else bool(before.step)
 
     def forget_origins(self, link: str) -> None:
-        """Follow the clocks of the buses that a peer brings anew, with its next batches."""
-        self._origins = {origin: known for origin, known in self._origins.items() if known.link != link}
+        """Follow the clocks that a peer has told anew, with its next batches."""
+        origins = self._origins.items()
+        self._origins = {origin: known for origin, known in origins if known.link != link or known.told is None}
 
     def step_of(self, origin: bytes) -> int:
         """The step of the clock of a bus between its last two live batches, in ns."""

@@ -472,7 +472,7 @@ class DomainEnd(Endpoint):
         for known in moved:
             if known.shown is not None and not self.bus.closed:
                 self.relay.remove(known.frame, None)
-        # All that the peer has brought has begun anew.
+        # All frames whose clocks the peer has told have begun anew.
         self.clocks.forget_origins(peer.id)
         if self.clocks.corrects and peer.rate:
             self._history.joined(peer.id)
