@@ -456,6 +456,16 @@ class DomainEnd(Endpoint):
         if peer.is_placed or not self.clocks.is_measured(peer.id):
             return
         peer.is_placed = True
+        self._correct_kept(peer)
+        # All frames whose clocks the peer has told have begun anew.
+        self.clocks.forget_origins(peer.id)
+        if self.clocks.corrects and peer.rate:
+            self._history.joined(peer.id)
+        if self.clocks.corrects and not self._history.open:
+            self._show()
+
+    def _correct_kept(self, peer: Peer) -> None:
+        """Correct the entries that a peer told before their clocks were known, and take them off the bus."""
         waiting: dict[Provenance, list[tuple[Known, FromLink]]] = {}
         for known in self.relay.replica.entries.values():
             source, sample = known.source, known.sample
@@ -472,12 +482,6 @@ class DomainEnd(Endpoint):
         for known in moved:
             if known.shown is not None and not self.bus.closed:
                 self.relay.remove(known.frame, None)
-        # All frames whose clocks the peer has told have begun anew.
-        self.clocks.forget_origins(peer.id)
-        if self.clocks.corrects and peer.rate:
-            self._history.joined(peer.id)
-        if self.clocks.corrects and not self._history.open:
-            self._show()
 
     def _begin_anew(self, peer: Peer, source: Provenance) -> None:
         """Forget the older samples of a bus whose stamps have jumped, because the newer ones do not go on from them."""
@@ -485,6 +489,17 @@ class DomainEnd(Endpoint):
         step = self.clocks.step_of(source.origin)
         if step:
             self.bus._announce(PeerClockStepped(self.bus.clock.now(), self.name, peer.id, to_seconds(step), frames))
+            return
+        entries = self.relay.replica.entries.values()
+        sources = [known.source for known in entries if known.source.origin == source.origin]
+        untold = [one for one in sources if one.peer is peer and one.told is None]
+        if untold:
+            # The clock of the bus is told for the first time: what rests is corrected, and stays.
+            for one in untold:
+                one.told = source.told
+            self._correct_kept(peer)
+            if not self._history.open:
+                self._show()
 
     def _tell_offsets(self) -> None:
         """Announce the clocks that have begun to differ from this one, or no longer do."""
