@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from support.domains import SECOND, Network, Process, SkewedClock, World
 from support.foreign_world import ForeignWorld
-from support.samples import moving
+from support.samples import moving, static
 
 from tfbus import (
     Buffer,
@@ -269,6 +269,50 @@ def test_a_joiner_is_told_the_newest_samples_and_the_past_by_another_bus_and_cor
             for sample in corrected:
                 assert sample.stamp / SECOND == pytest.approx(sample.transform.translation[0], abs=0.002)
             world.kill(late)
+
+
+@pytest.mark.parametrize("others_move", [False, True])
+def test_frames_of_one_batch_that_rest_are_all_corrected_and_stay(others_move: bool) -> None:
+    world = World()
+    network = Network(world)
+    network.delay = lambda *_: 0.0004
+    clock = SkewedClock(world, 7.0)
+    there = world.process(network, clock=clock)
+    said = [moving("map", name, clock.now()) for name in ("arm", "hand", "tool")]
+    there.say(static("map", "camera"), *said)
+    began = world.now
+    here = world.process(network, clock=SkewedClock(world), correct_clocks=True)
+    for _ in range(50):
+        if others_move:
+            publish(there, "cart", clock)
+        world.run(0.1)
+    for sample in said:
+        assert here.frames[sample.child].stamp == pytest.approx(began * SECOND, abs=2_000_000)
+    # Others are told the stamps that the sender gave.
+    world.kill(there)
+    late = world.process(network, clock=SkewedClock(world))
+    world.run(3.0)
+    assert {sample.child: sample.stamp for sample in said} == {s.child: late.frames[s.child].stamp for s in said}
+
+
+def test_frames_that_came_by_a_bridge_before_any_clock_was_known_are_corrected_when_it_is_told() -> None:
+    world = World()
+    first, second = Network(world), Network(world)
+    first.delay = second.delay = lambda *_: 0.0004
+    clock = SkewedClock(world, 7.0)
+    here = world.process(first, clock=SkewedClock(world), correct_clocks=True)
+    world.process(first, second, clock=SkewedClock(world))
+    there = world.process(second, clock=clock)
+    with Buffer(here.bus) as buffer:
+        world.run(0.01)
+        publish(there, "cart", clock)
+        publish(there, "arm", clock)
+        world.run(5.0)
+        publish(there, "cart", clock)
+        world.run(1.0)
+        found = {edge.child: (edge.oldest, edge.newest) for edge in buffer.tree.edges()}
+    for frame, spans in (("cart", (6.0, 1.0)), ("arm", (6.0, 6.0))):
+        assert found[frame] == pytest.approx([(world.now - seconds) * SECOND for seconds in spans], abs=2_000_000)
 
 
 @pytest.mark.parametrize("step", [1.0, -1.0, 0.03])

@@ -11,7 +11,7 @@ import pytest
 from support.domains import Network, Process, Stranger, World, agree, shown
 from support.samples import moving, static
 
-from tfbus import Buffer, Covariance, Transform, UncertainSample
+from tfbus import Buffer, Covariance, Transform, TransformStamped, UncertainSample
 from tfbus.links.message import Kind
 
 NAMES = [f"static{k}" for k in range(5)]
@@ -327,6 +327,30 @@ def test_a_late_sample_of_another_bus_brings_no_frame_back_that_was_withdrawn(dr
     earlier.say(earlier.batch(moving("map", "goal", 1), number=1))
     assert shown(process) == ({} if drop_lost else {"goal": 2})
     assert [sample.stamp for sample in process.seen] == ([2] if drop_lost else [2, 1])
+
+
+@pytest.mark.parametrize(
+    "batch",
+    [
+        (static("map", "a", 1.0), static("map", "a", 2.0)),
+        (moving("map", "a", 5, 1.0), moving("map", "a", 5, 2.0)),
+        (moving("map", "a", 5, 1.0), static("map", "a", 2.0)),
+        (static("map", "a", 1.0), moving("map", "a", -5, 2.0)),
+    ],
+)
+def test_of_two_samples_of_a_frame_in_one_batch_all_buses_and_late_joiners_hold_the_same(
+    batch: tuple[TransformStamped, ...],
+) -> None:
+    world = World()
+    networks = Network(world), Network(world)
+    one, two = world.process(*networks), world.process(*networks)
+    world.run(5.0)
+    one.say(*batch)
+    world.run(5.0)
+    late = world.process(networks[0])
+    world.run(5.0)
+    assert [process.frames["a"] for process in (one, two, late)] == [batch[1]] * 3
+    assert two.seen == list(batch)
 
 
 def test_copies_that_agree_cost_signs_only_and_ever_fewer() -> None:

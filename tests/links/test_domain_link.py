@@ -491,6 +491,23 @@ async def test_when_the_clock_jumps_back_moving_messages_that_wait_are_dropped_a
             await until(lambda: bus.statistics().frames == 2)
 
 
+async def test_a_message_that_tells_of_a_jump_back_is_published_whole_however_many_turns_it_takes() -> None:
+    network, clock, following = MemoryNetwork(), SimulatedClock(start=100), SimulatedClock()
+    heard: list[TransformStamped] = []
+    with Bus(clock) as bus, Bus(following) as other:
+        other.subscribe(heard.extend)
+        async with (
+            DomainLink(other, "tf", network.wire(), clock=following),
+            DomainLink(bus, "tf", network.wire(), tell_clock=True),
+        ):
+            await until(lambda: following.now() == 100)
+            clock.set(50)
+            for number in range(1_000):
+                bus.publish(moving("map", f"{number}", 50))
+            await until(lambda: following.now() == 50)
+            await until(lambda: len(heard) == 1_000)
+
+
 async def test_ctrl_c_in_a_task_of_the_wire_leaves_the_link_as_itself() -> None:
     class InterruptedWire(MemoryWire):
         async def run(self) -> None:

@@ -11,9 +11,10 @@ from tfbus import Bus, TransformStamped
 from tfbus.links import DomainLink
 from tfbus.links.channels import LONGEST_FILTER, MOST_FILTERS, filter_name
 from tfbus.links.domain import MOST_ROBOTS
-from tfbus.links.message import Heard, Kind, read_message
+from tfbus.links.message import Heard, Kind, Outgoing, read_message, write_message
 from tfbus.links.relay import relay_of
-from tfbus.links.replica import ReceivedBatch
+from tfbus.links.replica import CHUNK, ReceivedBatch
+from tfbus.links.seams import Received
 
 
 @pytest.fixture
@@ -111,6 +112,35 @@ def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_th
     assert counts(long) == {"f0": 3}
 
 
+def test_who_meets_a_link_with_names_that_are_too_long_has_its_static_frames_soon(
+    world: World, network: Network
+) -> None:
+    frames = [f"{number}{'x' * 150}" for number in range(CHUNK + 1)]
+    world.process(network, robot="r1")
+    some = world.process(network, robot="r2", frames=frames)
+    some.say(*(static("map", frame) for frame in frames))
+    world.run(5.0)
+    late = world.process(network)
+    world.run(10.0)
+    assert late.frames.keys() == set(frames)
+
+
+@pytest.mark.parametrize("letter", ["я", "框", "\udc80", '"'])
+def test_the_names_of_a_filter_may_be_in_any_script(letter: str) -> None:
+    world = World()
+    network = Network(world)
+    one = world.process(network)
+    size = len((letter * 18).encode("utf-8", "surrogatepass")) + len("1234,")
+    frames = [f"{number}{letter * 18}" for number in range(LONGEST_FILTER // size - 1)]
+    some = world.process(network, frames=[*frames, "plain"])
+    one.say(static("map", "plain"))
+    world.run(1.0)
+    one.say(static("map", frames[0]), moving("map", "plain", 1))
+    world.run(1.0)
+    assert counts(some)["plain"] == 2
+    assert (frames[0] in some.frames) == (letter != "\udc80"), "no message can hold half of a letter"
+
+
 def test_a_link_for_no_frame_at_all_hears_and_sends_nothing(world: World, network: Network) -> None:
     one, none = world.process(network), world.process(network, frames=[])
     one.say(static("map", "a"), moving("map", "b", 1))
@@ -161,6 +191,25 @@ def test_of_a_slow_robot_come_static_frames_at_once_and_the_newest_of_moving_one
     world.run(5.0)
     assert "base" not in slow.frames
     assert slow.end.lost == 0
+
+
+def test_a_message_of_newest_samples_is_taken_or_left_out_as_a_whole_however_long_its_parts_take() -> None:
+    world = World()
+    network = Network(world)
+    board = world.process(network, robots={"*": 0.5})
+    robot = Stranger(network, robot="r1")
+    world.run(1.0)
+    for second in range(5):
+        entries = [robot.batch(moving("map", f"{n}", second), number=second + 1) for n in range(1_000)]
+        message = write_message(Outgoing(Kind.LIVE, robot.bus), entries)
+        for part in board.end.split(Received(robot.id, message)):
+            if part is not None:
+                board.end.handle(robot.id, part)
+            # Other tasks have their turn.
+            world.now += 0.03
+        world.run(0.8)
+    assert set(counts(board).values()) == {3}
+    assert len(board.frames) == 1_000
 
 
 def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer(world: World, network: Network) -> None:

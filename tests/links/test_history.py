@@ -12,7 +12,7 @@ from support.samples import moving, static
 from tfbus import SECOND, Buffer, Bus, TransformStamped
 from tfbus.links import DomainLink
 from tfbus.links.history import LONGEST_HISTORY, MOST_HELD, MOST_OF_FRAME, PATIENCE
-from tfbus.links.message import Kind
+from tfbus.links.message import Kind, Outgoing, write_message
 from tfbus.links.replica import Claim
 
 
@@ -134,6 +134,15 @@ def test_the_past_comes_in_chunks_of_whole_frames_in_order_and_is_bounded() -> N
     assert sum(kind is Kind.PAST for kind, _ in network.carried) == 4
 
 
+def test_a_sample_that_no_message_can_hold_keeps_none_of_the_past_from_late_joiners() -> None:
+    world, network, teller, _ = scene()
+    teller.say(*(moving("map", name, second * SECOND) for name in "ac" for second in range(5)))
+    teller.say(moving("map", "b", SECOND), moving("x" * 2_000, "b", 2 * SECOND), moving("map", "b", 3 * SECOND))
+    late = world.process(network, history=60.0)
+    world.run(5.0)
+    assert [stamps_of(late.seen, name) for name in "abc"] == [[0, 1, 2, 3, 4], [1, 3], [0, 1, 2, 3, 4]]
+
+
 def test_a_peer_is_asked_once_even_if_it_comes_back() -> None:
     world, network, teller, _ = scene()
     teller.say(moving("map", "base", SECOND))
@@ -155,8 +164,11 @@ def test_what_was_held_back_comes_when_the_peer_says_nothing_leaves_or_sends_too
     late = world.process(network, history=5.0)
     peer = Stranger(network)
     world.run(0.01)
-    for stamp in range(MOST_HELD + 2 if end == "many" else 3):
-        peer.say(peer.batch(moving("map", "base", stamp), number=stamp + 10))
+    count = MOST_HELD + 2 if end == "many" else 3
+    for stamp in range(count):
+        batch = peer.batch(moving("map", "base", stamp), number=stamp + 10)
+        peer.publish("all", write_message(Outgoing(Kind.LIVE, peer.bus, stamp + 1), [batch]))
+    world.run(0.01)
     if end != "many":
         assert late.seen == []
     past = peer.batch(moving("map", "base", 0), number=9)
@@ -176,12 +188,7 @@ def test_what_was_held_back_comes_when_the_peer_says_nothing_leaves_or_sends_too
                 peer.say(past, kind=Kind.PAST, claim=Claim(0, 0, 0, final=False))
             assert len(peer.heard(Kind.PAST_QUESTION)) == 2
     heard = [sample.stamp for sample in late.seen]
-    expected = list(range(MOST_HELD + 2 if end == "many" else 3))
-    if end == "many":
-        # The end of it came live; the rest when the past does not come.
-        world.run(PATIENCE)
-        heard = sorted(sample.stamp for sample in late.seen)
-    assert heard == ([0] if end in ("answer", "same again") else []) + expected
+    assert heard == ([0] if end in ("answer", "same again") else []) + list(range(count))
     assert late.end.rejected.keys() <= {"number"}
 
 

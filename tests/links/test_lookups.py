@@ -21,6 +21,7 @@ from tfbus import (
     LATEST,
     Buffer,
     Bus,
+    Clock,
     Covariance,
     DisconnectedError,
     FutureExtrapolationError,
@@ -28,6 +29,7 @@ from tfbus import (
     LookupTimeoutError,
     PastExtrapolationError,
     RemoteLookupError,
+    SimulatedClock,
     Transform,
     TransformStamped,
     UncertainSample,
@@ -77,9 +79,9 @@ class Scene:
 
 
 @asynccontextmanager
-async def asked(**options: Any) -> AsyncIterator[Scene]:
+async def asked(clock: Clock | None = None, **options: Any) -> AsyncIterator[Scene]:
     network = MemoryNetwork()
-    with Bus() as bus, Buffer(bus) as buffer, Bus() as other:
+    with Bus(clock) as bus, Buffer(bus) as buffer, Bus() as other:
         async with (
             DomainLink(bus, "tf", network.wire("r1"), robot="r1") as link,
             BufferServer(buffer, link, **options) as server,
@@ -319,6 +321,18 @@ async def test_a_long_wait_is_asked_for_in_parts() -> None:
             await scene.lookup("map", "nothing", timeout=25.0)
         assert late.value.timeout == 25.0
         assert isinstance(late.value.__cause__, UnknownFrameError)
+
+
+@in_simulated_time
+async def test_a_lookup_waits_for_a_server_whose_simulated_clock_stands_still() -> None:
+    async with asked(SimulatedClock()) as scene, anyio.create_task_group() as tasks:
+        waiting = Asked(tasks, lambda: scene.lookup("map", "base"))
+        with pytest.raises(LookupTimeoutError) as late:
+            await scene.lookup("map", "nothing", timeout=60.0)
+        assert isinstance(late.value.__cause__, UnknownFrameError)
+        scene.bus.publish(static("map", "base"))
+        await until(lambda: waiting.ended)
+        assert waiting.answer.static
 
 
 @in_simulated_time

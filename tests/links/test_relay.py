@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support import strategies as some
-from support.domains import Network, Process, Stranger, World, agree
+from support.domains import Network, Process, Stranger, World, agree, finish
 from support.foreign_world import ForeignTransform, ForeignWorld
 from support.processes import peak_of
 from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, PeerLost, SimulatedClock, TransformStamped
 from tfbus.links.message import Kind
-from tfbus.links.relay import MOST_PASSED
-from tfbus.links.replica import OutgoingBatch, ReceivedTransform, RemovedFrame, Replica
+from tfbus.links.relay import MOST_PASSED, relay_of
+from tfbus.links.replica import MOST_REMOVALS, OutgoingBatch, ReceivedTransform, RemovedFrame, Replica
 from tfbus.tf_message import decode, encode
 
 Graph = Sequence[Sequence[int]]
@@ -275,6 +275,23 @@ def test_what_a_lost_bus_has_said_does_not_take_a_frame_over_when_it_is_late_and
     assert len(listener.seen) == 2
 
 
+def test_a_removal_that_all_buses_of_a_ring_forget_goes_round_once() -> None:
+    world, (one, *_, last) = domains(GRAPHS["ring"])
+    one.say(static("map", "old"))
+    known = relay_of(one.bus).replica.entries["old"].source.sequence
+    stranger = Stranger(one.networks[0])
+    for first in range(0, MOST_REMOVALS, MOST_REMOVALS // 4):
+        later = range(first, first + MOST_REMOVALS // 4)
+        stranger.say(*(stranger.removal(f"{number}", known + 100 + number) for number in later))
+    world.run(10.0)
+    for network in one.networks:
+        network.sent()
+    stranger.say(stranger.removal("old", known + 1), stranger.removal("unknown", known + 2))
+    world.run(10.0)
+    assert last.frames == {}
+    assert sum(network.sent(Kind.LIVE) for network in one.networks) < 20
+
+
 @pytest.mark.thorough
 def test_frames_that_come_and_go_by_the_ten_thousand_leave_little_behind() -> None:
     world, (one, two) = domains(GRAPHS["pair"])
@@ -306,6 +323,20 @@ def test_an_ended_link_forgets_and_its_bus_can_go_on_or_close() -> None:
     two.bus.close()
     world.run(5.0)
     assert two.end.rejected == {}
+
+
+def test_when_one_of_two_links_ends_what_it_brought_stays_and_the_other_leads_there_no_more() -> None:
+    world, (one, bridge, other) = domains([[0, 1], [1, 2]], drop_lost=True)
+    one.say(static("map", "a"))
+    world.run(1.0)
+    ended = bridge.ends.pop(0)
+    ended.detach()
+    ended.send()
+    finish(ended.network.close())
+    world.run(10.0)
+    world.process(other.networks[0])
+    world.run(10.0)
+    assert (set(bridge.frames), set(other.frames)) == ({"a"}, set())
 
 
 # Samples that came over a link

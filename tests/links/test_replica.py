@@ -289,6 +289,27 @@ def test_a_peer_that_still_fetches_the_copies_of_others_is_asked_once_it_has_the
     assert link.next_question(0.7) == Question("b", 1)
 
 
+@pytest.mark.parametrize("end", ["answers", "leaves", "is heard live"])
+def test_a_link_fetches_until_it_has_the_last_answer_or_needs_it_no_more(end: str) -> None:
+    link = Asker("a", "b")
+    link.answer(link.next_question(0.0) or Question("", 0))
+    for _ in range(3):
+        link.say("a", heard=False)
+    link.sign("a")
+    link.answer(link.next_question() or Question("", 0), limit=2)
+    assert link.agreement.fetches
+    match end:
+        case "answers":
+            link.answer(link.next_question(0.0) or Question("", 0))
+        case "leaves":
+            link.agreement.left("a")
+        case "is heard live":
+            link.copy.note("f3", (3, OTHER), static("map", "f3"))
+            link.sign("a")
+            assert link.next_question() is None
+    assert not link.agreement.fetches
+
+
 def test_a_link_that_is_behind_asks_only_the_first_question_at_once_and_one_in_ten_seconds() -> None:
     link = Asker("a", "b")
     link.is_behind = True

@@ -300,6 +300,15 @@ def test_too_many_frames_of_a_bus_are_refused_and_counted_and_those_that_went_ma
     assert len(scene.frames) > 3 * (MANY_ORIGINS - 2)
 
 
+def test_frames_in_the_name_of_this_bus_are_bounded_like_those_of_others_and_its_own_are_not() -> None:
+    scene = Scene(max_frames=3)
+    scene.say(*(moving("map", name, 1) for name in "abcde"), number=1, origin=scene.origin)
+    assert (scene.frames, scene.rejected) == ({"a", "b"}, {"too many frames": 3})
+    scene.process.say(*(moving("map", f"{number}", 1) for number in range(3 * MANY_ORIGINS)))
+    scene.say(moving("map", "f", 1), number=2)
+    assert len(scene.frames) == 3 + 3 * MANY_ORIGINS
+
+
 def test_batches_with_too_many_authorities_of_a_peer_are_refused_and_counted(scene: Scene) -> None:
     for number in range(MAX_AUTHORITIES + 2):
         scene.say(static("map", "a", authority=f"node {number}"), number=number + 1)
@@ -400,6 +409,12 @@ def test_an_answer_about_the_past_that_nobody_has_asked_for_changes_nothing() ->
 
 
 # Ways
+
+
+def test_a_peer_leads_to_one_bus_and_to_those_in_its_signs_whatever_buses_it_names(scene: Scene) -> None:
+    for number in range(100):
+        scene.stranger.say_bytes(write_message(Outgoing(Kind.LIVE, b"%16d" % number, number + 1)))
+    assert len(list(scene.process.end.ways())) == 1
 
 
 def test_a_bus_that_a_peer_says_it_reaches_is_there_while_it_says_so() -> None:

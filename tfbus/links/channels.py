@@ -7,7 +7,7 @@ rate; its messages have no numbers. A message for a channel without listeners is
 """
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 from typing import Final
 
@@ -104,13 +104,9 @@ class Channels:
             if self._is_heard(channel, now):
                 claim = view.claim(now, channel.frames)._replace(final=is_whole)
                 sign = Outgoing(Kind.SIGN, self._bus, channel.number, claim, self._time, reach, serves, clocks)
-                first, *others = channel.names
-                self._wire.publish(first, write_message(sign))
-                if others:
-                    # A copy of some frames is not to be compared with that of all.
-                    message = write_message(replace(sign, claim=claim._replace(partial=True)))
-                    for name in others:
-                        self._wire.publish(name, message)
+                message = write_message(sign)
+                for name in channel.names:
+                    self._wire.publish(name, message)
 
     def send_slowly(self, now: float) -> float:
         """Publish the newest sample of each moving frame if it is time; returns the next time for that."""

@@ -440,6 +440,11 @@ class Clocks:
         before.step = step if abs(step) > limit else 0
         return abs(moved) > limit if self.corrects else bool(before.step)
 
+    def forget_origins(self, link: str) -> None:
+        """Follow the clocks that a peer has told anew, with its next batches."""
+        origins = self._origins.items()
+        self._origins = {origin: known for origin, known in origins if known.link != link or known.told is None}
+
     def step_of(self, origin: bytes) -> int:
         """The step of the clock of a bus between its last two live batches, in ns."""
         return self._origins[origin].step

@@ -42,6 +42,7 @@ from tfbus.links.replica import (
     Claim,
     Entry,
     FromLink,
+    Known,
     Provenance,
     ReceivedBatch,
     RemovedFrame,
@@ -177,8 +178,8 @@ class DomainEnd(Endpoint):
 
     def detach(self) -> None:
         self.lookups.close()
-        for peer in list(self.peers.values()):
-            self._forget(peer)
+        while self.peers:
+            self._forget(self.peers.popitem()[1])
         self.relay.detach(self)
 
     def work(self) -> float:
@@ -218,6 +219,9 @@ class DomainEnd(Endpoint):
             yield item.content
             return
         for part in read_message(item.content):
+            # A message that comes before its time is left out as a whole, however long its parts take.
+            if isinstance(part, Heard) and not part.continues and self._is_thinned(item.sender, part):
+                return
             yield part
             # Only a sign without a time may rest, because a clock may be followed later.
             is_plain = isinstance(part, Heard) and part.kind is Kind.SIGN and part.time is None
@@ -346,8 +350,6 @@ class DomainEnd(Endpoint):
         peer = self.peers.get(sender)
         if peer is None or not peer.present or self.bus.closed:
             return
-        if heard.kind is Kind.LIVE and self._is_thinned(peer, heard):
-            return
         if heard.time is not None:
             self._hear_time(sender, heard.time)
         if not heard.continues:
@@ -359,8 +361,11 @@ class DomainEnd(Endpoint):
                     return
             if heard.kind is not Kind.SIGN:
                 self.messages += 1
-        if heard.kind is Kind.LIVE and sender in self._history.open and self._history.holds(sender, heard):
-            return
+        if heard.kind is Kind.LIVE and sender in self._history.open:
+            if self._history.holds(sender, heard):
+                return
+            # The held messages come before this one, or they would be no news.
+            self._end_history(peer)
         self._take_held(peer, heard)
 
     def _take_held(self, peer: Peer, heard: Heard) -> None:
@@ -451,21 +456,32 @@ class DomainEnd(Endpoint):
         if peer.is_placed or not self.clocks.is_measured(peer.id):
             return
         peer.is_placed = True
-        for known in list(self.relay.replica.entries.values()):
-            source, sample = known.source, known.sample
-            if source.peer is not peer or source.clock is not None or not isinstance(sample, FromLink):
-                continue
-            # Others may hold the sample as it came. It has no source yet if the bus had it from elsewhere.
-            moved = sample.again(source)
-            self._correct(peer, source, () if sample.static else (moved,))
-            if source.shift and not sample.static:
-                known.sample = moved
-                if known.shown is not None and not self.bus.closed:
-                    self.relay.remove(known.frame, None)
+        self._correct_kept(peer)
+        # All frames whose clocks the peer has told have begun anew.
+        self.clocks.forget_origins(peer.id)
         if self.clocks.corrects and peer.rate:
             self._history.joined(peer.id)
         if self.clocks.corrects and not self._history.open:
             self._show()
+
+    def _correct_kept(self, peer: Peer) -> None:
+        """Correct the entries that a peer told before their clocks were known, and take them off the bus."""
+        waiting: dict[Provenance, list[tuple[Known, FromLink]]] = {}
+        for known in self.relay.replica.entries.values():
+            source, sample = known.source, known.sample
+            if source.peer is peer and source.clock is None and isinstance(sample, FromLink):
+                waiting.setdefault(source, []).append((known, sample))
+        moved: list[Known] = []
+        for source, together in waiting.items():
+            # Others may hold the samples as they came. They have no source yet if the bus had them from elsewhere.
+            moving = [(known, sample.again(source)) for known, sample in together if not sample.static]
+            self._correct(peer, source, [sample for _, sample in moving])
+            for known, sample in moving if source.shift else ():
+                known.sample = sample
+                moved.append(known)
+        for known in moved:
+            if known.shown is not None and not self.bus.closed:
+                self.relay.remove(known.frame, None)
 
     def _begin_anew(self, peer: Peer, source: Provenance) -> None:
         """Forget the older samples of a bus whose stamps have jumped, because the newer ones do not go on from them."""
@@ -473,6 +489,17 @@ class DomainEnd(Endpoint):
         step = self.clocks.step_of(source.origin)
         if step:
             self.bus._announce(PeerClockStepped(self.bus.clock.now(), self.name, peer.id, to_seconds(step), frames))
+            return
+        entries = self.relay.replica.entries.values()
+        sources = [known.source for known in entries if known.source.origin == source.origin]
+        untold = [one for one in sources if one.peer is peer and one.told is None]
+        if untold:
+            # The clock of the bus is told for the first time: what rests is corrected, and stays.
+            for one in untold:
+                one.told = source.told
+            self._correct_kept(peer)
+            if not self._history.open:
+                self._show()
 
     def _tell_offsets(self) -> None:
         """Announce the clocks that have begun to differ from this one, or no longer do."""
@@ -487,7 +514,11 @@ class DomainEnd(Endpoint):
 
     def _remove(self, view: View, source: Provenance, frame: str) -> bool:
         """Note a removal; returns whether it was news for the map."""
-        is_news = view.holds(frame) and self.relay.replica.note(frame, source, None, view.route)
+        replica = self.relay.replica
+        was_known = frame in replica.entries
+        is_news = view.holds(frame) and replica.note(frame, source, None, view.route)
+        # One that is forgotten at once is news only where the frame is, or it would go round in a ring of buses.
+        is_news = is_news and (was_known or frame in replica.entries)
         if is_news:
             self.relay.remove(frame, source)
         return is_news
@@ -558,15 +589,18 @@ class DomainEnd(Endpoint):
             self.lost += missing
         return known and missing > 0
 
-    def _is_thinned(self, peer: Peer, heard: Heard) -> bool:
+    def _is_thinned(self, sender: str, heard: Heard) -> bool:
         """Whether a message with newest samples comes before its time."""
-        if heard.number or peer.rate == inf:
+        if heard.number or heard.kind is not Kind.LIVE:
+            return False
+        peer = self.peers.get(sender)
+        if peer is None or peer.rate == inf:
             return False
         now = self._now()
         since = now - peer.thinned
         # Samples that belong together come in several messages at once.
         if since > 0.02:
-            if since < 0.9 / peer.rate:
+            if since * peer.rate < 0.9:
                 return True
             peer.thinned = now
         return False
@@ -609,10 +643,10 @@ class DomainEnd(Endpoint):
         if heard.kind in (Kind.SIGN, Kind.MEETING):
             told = {bus: (heard.bus, *path) for bus, path in heard.reach if bus != own and own not in path}
             paths = {heard.bus: (), **{bus: path for bus, path in told.items() if bus != heard.bus}}
-        elif heard.bus in peer.paths:
+        elif peer.paths:
             return
         else:
-            paths = {**peer.paths, heard.bus: ()}
+            paths = {heard.bus: ()}
         paths.pop(own, None)
         if paths == peer.paths:
             return

@@ -24,9 +24,9 @@ MOST_OF_FRAME = 2_000
 LONGEST_HISTORY = 3_600.0
 """s."""
 MOST_HELD = 1_000
-"""The most live messages of one peer that wait for its past; then the link asks the peer for no more."""
+"""The most live messages of one peer that wait for its past; with one more, the link goes on without the rest of it."""
 MOST_HELD_SAMPLES = 100_000
-"""The most samples and removals in the waiting messages of all peers together; further messages do not wait."""
+"""The most samples and removals in the waiting messages of all peers together; beyond it, the same."""
 PATIENCE = 5.0
 """s; the longest wait for one answer."""
 MOST_REMEMBERED = 10_000
@@ -62,7 +62,7 @@ def chunk_of_past(bus: Bus, brought: Iterable[Known], seconds: float, after: str
 
 
 def _recent(bus: Bus, frame: str, seconds: float) -> list[TransformStamped]:
-    """The newest samples of a frame, of the buffer that holds the longest history of it."""
+    """The newest samples of a frame that a message can hold, of the buffer that holds the longest history of it."""
     held = (live.forest.frames.get(frame) for live in bus._trees)
     histories = [history for history in held if history is not None and history.oldest is not None]
     if not histories:
@@ -129,7 +129,7 @@ class HistoryAsker:
             return False
         batches = (entry for entry in message.entries if isinstance(entry, ReceivedBatch))
         last = max((sample.child for batch in batches for sample in batch.samples), default="")
-        if last <= waiting.after or len(waiting.held) >= MOST_HELD:
+        if last <= waiting.after:
             return False
         self._ask(peer, last)
         return True

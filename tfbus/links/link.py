@@ -391,23 +391,24 @@ class Link(AsyncOnly):
 
     def _handle_part(self) -> bool:
         """Handle the next part of a large message that was begun, or else of the next item; False without any."""
-        if self._whole is None:
-            item = self._receive_queue.get()
-            if item is None:
+        whole, self._whole = self._whole, None
+        if whole is None:
+            whole = self._receive_queue.get()
+            if whole is None:
                 return False
-            self._whole, self._parts = item, self._end.split(item)
-        whole = self._whole
+            self._parts = self._end.split(whole)
         try:
             part = next(self._parts)
         except StopIteration:
-            self._whole = None
+            return True
         except MalformedMessageError as error:
-            self._whole = None
             self._end.handle(whole.sender, error)
-        else:
-            # A large batch is decoded over several turns, and then handled at once.
-            if part is not None:
-                self._end.handle(whole.sender, part)
+            return True
+        # A large batch is decoded over several turns, and then handled at once.
+        if part is not None:
+            self._end.handle(whole.sender, part)
+        # Only now, because a part may tell of a jump of the clock, which drops the rest of earlier messages.
+        self._whole = whole
         return True
 
     def _clock_jumped(self, before: int, after: int) -> None:

@@ -363,9 +363,7 @@ class BufferServer(AsyncOnly):
         answer: TransformStamped | Exception | None = None
         with scope:
             try:
-                # Not a number is not less either.
-                timeout = LONGEST_WAIT if question.timeout is None else min(LONGEST_WAIT, question.timeout)
-                answer = await self._buffer.lookup(**_arguments(question), timeout=timeout)
+                answer = await self._look_up(question)
             except Exception as error:  # noqa: BLE001 - it is told to the asker
                 answer = error
             finally:
@@ -374,6 +372,21 @@ class BufferServer(AsyncOnly):
                     del self._waiting[key]
         if answer is not None:
             self._answer(key, answer)
+
+    async def _look_up(self, question: RemoteQuestion) -> TransformStamped:
+        """The answer, in time by the clock of the bus and by that of this machine: a simulated one may stand still."""
+        # Not a number is not less either.
+        timeout = LONGEST_WAIT if question.timeout is None else min(LONGEST_WAIT, question.timeout)
+        answer: TransformStamped
+        with anyio.move_on_after(timeout):
+            answer = await self._buffer.lookup(**_arguments(question), timeout=timeout)
+            return answer
+        try:
+            answer = self._buffer.lookup_nowait(**_arguments(question))
+        except MAY_COME as missing:
+            target, source = question.target, question.source
+            raise LookupTimeoutError(target=target, source=source, timeout=timeout, missing=missing) from missing
+        return answer
 
     def _answer(self, key: tuple[str, int], answer: TransformStamped | Exception) -> None:
         """Count an answer and send it; no error of one question ends the task."""

@@ -541,7 +541,9 @@ class RemoteQuestion(PlainData):
 
 def write_question(question: PlainData) -> bytes:
     """The bytes of a question."""
-    return json.dumps(question.to_dict()).encode()
+    # Without escapes: all names that `frames=` may have fit, in any script.
+    text = json.dumps(question.to_dict(), ensure_ascii=False, separators=(",", ":"))
+    return text.encode("utf-8", "surrogatepass")
 
 
 def read_question(kind: type[QuestionT], data: bytes) -> QuestionT:
@@ -626,7 +628,7 @@ def _check_answers(answer: TransformStamped, question: RemoteQuestion) -> None:
 def _read(data: bytes) -> dict[str, Any]:
     """The JSON object in some bytes; raises `ValueError` if they are none, or beyond a bound."""
     try:
-        fields = _decoder.decode(data.decode())
+        fields = _decoder.decode(data.decode("utf-8", "surrogatepass"))
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     if not isinstance(fields, dict):

@@ -345,7 +345,7 @@ class Replica:
     Attributes
     ----------
     origin : bytes
-        The name of the bus for others: 16 random bytes. Its own frames are not counted.
+        The name of the bus for others: 16 random bytes.
     entries : dict of str to Known
     sequence : int
         The number of the newest change.
@@ -355,7 +355,7 @@ class Replica:
         self.origin = os.urandom(16)
         self.entries: dict[str, Known] = {}
         self.sequence = 0
-        # How many frames each other origin has.
+        # How many frames each origin has, this bus too: a stranger may speak in its name.
         self._held: Counter[bytes] = Counter()
         # Their sum, because a peer may tell of as many origins as frames.
         self._taken = 0
@@ -390,7 +390,7 @@ class Replica:
         route : tuple of View
             The views to which this brings the frame.
         max_frames : float
-            How many frames one origin may have, but for the own one.
+            How many frames one origin may have.
         settles : bool
             Whether the entry may change again in a moment: it is a live sample of a moving frame.
 
@@ -515,14 +515,22 @@ class Replica:
     def _replaces(source: Provenance, sample: TransformStamped | None, known: Known) -> bool:
         if source.sequence != known.source.sequence or source.origin != known.source.origin:
             return source.rank > known.source.rank
-        # Two samples of one batch, by the stamps that its sender gave them.
-        shift = source.shift - known.source.shift
-        return sample is not None and known.sample is not None and sample.stamp - shift > known.sample.stamp
+        before = known.sample
+        if sample is None or before is None:
+            return False
+        if not (sample.static or before.static):
+            # Two moving samples of one batch, by the stamps that its sender gave them.
+            newer = (sample.stamp - source.shift) - (before.stamp - known.source.shift)
+            if newer:
+                return newer > 0
+        # Otherwise the last one of the batch holds, as on its own bus; the same one again is not new.
+        return (sample.parent, sample._row, sample.static) != (before.parent, before._row, before.static)
 
     def _admit(self, origin: bytes, known: Known | None, sample: TransformStamped | None, max_frames: float) -> None:
         """Count a new entry in place of a known one."""
-        if sample is not None and origin != self.origin:
-            if self._held[origin] >= max_frames or self._taken >= MANY_ORIGINS * max_frames:
+        if sample is not None:
+            taken = self._taken - self._held[self.origin]
+            if self._held[origin] >= max_frames or taken >= MANY_ORIGINS * max_frames:
                 raise TooManyEntriesError(f"the peer has announced more than {max_frames} frames")
             self._held[origin] += 1
             self._taken += 1
@@ -534,7 +542,7 @@ class Replica:
         origin = known.source.origin
         if known.sample is None:
             del self._removals[bisect_left(self._removals, (known.source.rank, known.frame))]
-        elif origin != self.origin:
+        else:
             self._held[origin] -= 1
             self._taken -= 1
             if not self._held[origin]:
@@ -653,6 +661,8 @@ class _Copy:
         Whether the question is not put off.
     missed : bool
         Whether live messages are missing.
+    fetches : bool
+        Whether the last answer was not the whole one.
     fruitless, silences : int
         Answers without news, and questions without an answer, one after the other.
     differs : int
@@ -669,6 +679,7 @@ class _Copy:
     again: float = inf
     urgent: bool = False
     missed: bool = False
+    fetches: bool = False
     fruitless: int = 0
     silences: int = 0
     differs: int = 0
@@ -685,15 +696,9 @@ class Agreement:
     """Decides which peer a link asks next, so that its copies come to agree with the copies of its peers; see above.
 
     Nothing here knows an event loop: the caller hands in each time, in s of a monotonic clock.
-
-    Attributes
-    ----------
-    fetches : bool
-        Whether a peer tells its copy in several answers, and the last one has not come yet.
     """
 
     def __init__(self) -> None:
-        self.fetches: bool = False
         self._copies: dict[str, _Copy] = {}
         self._remembered: dict[str, tuple[View, int]] = {}
         self._asked: Question | None = None
@@ -701,6 +706,11 @@ class Agreement:
         # The time at which one of the questions that were put off is asked.
         self._latest = inf
         self._is_new = True
+
+    @property
+    def fetches(self) -> bool:
+        """Whether a peer tells its copy in several answers, and the last one has not come yet."""
+        return any(copy.fetches for copy in self._copies.values())
 
     def joined(self, peer: str, view: View, now: float, must_ask: bool = False) -> None:
         """Begin to follow the copy of a peer; it has to be asked if this is the first one, or if the caller says so."""
@@ -724,13 +734,13 @@ class Agreement:
             if len(self._remembered) > MOST_REMEMBERED:
                 del self._remembered[next(iter(self._remembered))]
         if self._asked is not None and self._asked.peer == peer:
-            self._asked, self.fetches = None, False
+            self._asked = None
             self._is_new = self._is_new or not any(other.seen for other in self._copies.values())
 
     def told(self, peer: str, claim: Claim, now: float, soon: bool = False) -> None:
         """Take the claim in a sign of a peer; with `soon`, ask for missing entries at once."""
         copy = self._copies.get(peer)
-        if copy is None or (claim.partial and copy.frames is None):
+        if copy is None:
             return
         if copy.claim is not None and claim.sequence < copy.claim.sequence:
             return
@@ -741,7 +751,7 @@ class Agreement:
             copy.silences = 0
             copy.due = min(copy.due, now + uniform(0.05, 0.2))
         if not copy.missed and self._agrees(copy, now):
-            copy.seen, copy.due, copy.fruitless = claim.sequence, inf, 0
+            copy.seen, copy.due, copy.fruitless, copy.fetches = claim.sequence, inf, 0, False
         elif claim.sequence > copy.seen:
             if not claim.final:
                 # Most of what the peer still fetches is here. Its next sign comes soon, unless the fetching never ends.
@@ -769,7 +779,7 @@ class Agreement:
             # An answer that leads nowhere.
             self._fail(copy, now)
             return
-        self.fetches = not claim.final
+        copy.fetches = not claim.final
         copy.seen = claim.sequence
         copy.due, copy.urgent = now, True
         copy.again = now + _ASK_AGAIN if copy.must_ask else inf
@@ -818,6 +828,7 @@ class Agreement:
                 self._asked, self._patience = Question(peer, copy.seen), now + PATIENCE
                 return self._asked
             copy.seen = max(copy.seen, 0 if copy.claim is None else copy.claim.sequence)
+            copy.fetches = False
 
     def rests(self, peer: str, now: float) -> bool:
         """Whether the copies agree and no question to a peer is open, so that the same sign again needs no work."""
@@ -844,7 +855,7 @@ class Agreement:
         return claim.digest ^ copy.view.claim(now, copy.frames).digest
 
     def _fail(self, copy: _Copy, now: float) -> None:
-        self.fetches = False
+        copy.fetches = False
         copy.silences = min(copy.silences + 1, 10)
         copy.missed = True
         longest = _LONGEST_PAUSE
