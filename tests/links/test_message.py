@@ -130,9 +130,8 @@ batches = st.builds(
     st.none() | st.integers(-(2**63) + 1, 2**63 - 1),
 )
 claims = st.builds(
-    lambda one, other, digest, final, partial: Claim(min(one, other), max(one, other), digest, final, partial),
+    lambda one, other, digest, final: Claim(min(one, other), max(one, other), digest, final),
     *[NUMBERS] * 3,
-    st.booleans(),
     st.booleans(),
 )
 buses = st.binary(min_size=16, max_size=16)
@@ -201,9 +200,9 @@ def test_the_section_of_clocks_is_taken_off_before_a_message_is_read() -> None:
 def test_a_message_is_laid_out_as_its_module_says() -> None:
     a, b, c = moving("map", "a", 1, authority="slam"), static("map", "b"), static("map", "c", authority="slam")
     entries: list[Entry] = [replace(batch(a, a, b, c, number=7), clock=77), RemovedFrame(OTHER, 8, "köln")]
-    out = Outgoing(Kind.ANSWER, BUS, 5, Claim(6, 7, 8, partial=True), -9, [(OTHER, (ONE, BUS)), (ONE, ())], serves=True)
+    out = Outgoing(Kind.ANSWER, BUS, 5, Claim(6, 7, 8), -9, [(OTHER, (ONE, BUS)), (ONE, ())], serves=True)
     assert write_message(out, entries) == (
-        header(5, 1 + 2 + 4 + 8, 2, 2, 2, 2, claim=(6, 7, 8))
+        header(5, 1 + 2 + 4, 2, 2, 2, 2, claim=(6, 7, 8))
         + struct.pack("<q", -9)
         + (OTHER + b"\2" + ONE + BUS)
         + (ONE + b"\0")
@@ -326,7 +325,7 @@ UNCERTAIN = (
         (header(kind=77), "version"),
         (header()[:-1], "head"),
         (header(claim=(2, 1, 0)), "head"),
-        (header(flags=5), "head"),
+        (header(flags=3), "head"),
         (header(reach=1), "head"),
         (header(reach=1) + ONE + b"\2" + ONE, "head"),
         (header(reach=1) + ONE + bytes((LONGEST_WAY + 1,)) + ONE * (LONGEST_WAY + 1), "head"),

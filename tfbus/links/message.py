@@ -65,7 +65,7 @@ from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, Latest
 from tfbus.tf_message import MAX_NAME, Decoded, MalformedMessageError, decode, decode_in_parts, encode, refusal
 from tfbus.uncertainty.answers import UncertainTransform
 
-VERSION = 7
+VERSION = 8
 MAX_BYTES = 2**22
 """The largest message with samples that is sent or read."""
 MAX_HEAD = 2**20
@@ -102,7 +102,7 @@ _ORIGIN = struct.Struct("<16sq")
 _BATCH, _REMOVAL, _UNCERTAIN = 0, 1, 2
 _COVARIANCE = struct.Struct("<21d")
 _UPPER = np.triu_indices(6)
-_FINAL, _PARTIAL, _HAS_TIME, _SERVES, _HAS_CLOCKS = 1, 2, 4, 8, 16
+_FINAL, _HAS_TIME, _SERVES, _HAS_CLOCKS = 1, 2, 4, 8
 _NO_CLOCK = -(2**63)
 _BUS = 16
 
@@ -290,7 +290,7 @@ def _head(out: Outgoing, entries: Sequence[Entry]) -> bytes:
         if kind == _UNCERTAIN:
             body += b"".join(map(_write_belief, entry.samples))
     claim = out.claim
-    flags = _FINAL * claim.final | _PARTIAL * claim.partial | _HAS_TIME * (out.time is not None) | _SERVES * out.serves
+    flags = _FINAL * claim.final | _HAS_TIME * (out.time is not None) | _SERVES * out.serves
     flags |= _HAS_CLOCKS * bool(out.clocks)
     counts = len(out.reach), len(origins), len(authorities), len(entries)
     held = claim.since, claim.sequence, claim.digest
@@ -460,7 +460,7 @@ def _read_head(
     # Slicing past the end raises nothing, so the end is checked.
     if at > len(data) or at > MAX_HEAD:
         raise IndexError
-    claim = Claim(since, sequence, digest, bool(flags & _FINAL), bool(flags & _PARTIAL))
+    claim = Claim(since, sequence, digest, bool(flags & _FINAL))
     heard = Heard(kind, bus, number, claim, time, reach, bool(flags & _SERVES))
     return heard, at, told, tags, beliefs
 

@@ -324,15 +324,12 @@ class Claim(NamedTuple):
         The digest of the copy at `sequence`; 0 in an answer if `final` is not set.
     final : bool
         Whether `sequence` is the newest; in a sign, whether the sender has fetched all answers.
-    partial : bool
-        Whether the sender's copy has only some frames.
     """
 
     since: int
     sequence: int
     digest: int
     final: bool = True
-    partial: bool = False
 
 
 class TooManyEntriesError(ValueError):
@@ -604,7 +601,7 @@ class View:
             for known in filter(None, map(self._replica.entries.get, frames)):
                 if self in known.views:
                     digest ^= known.digest
-        return Claim(self._replica.sequence, self._replica.sequence, digest, partial=self._frames is not None)
+        return Claim(self._replica.sequence, self._replica.sequence, digest)
 
     def changes(
         self, since: int, now: float, frames: Collection[str] | None = None, limit: int = CHUNK
