@@ -294,11 +294,12 @@ class DomainEnd(Endpoint):
     def take(self, link: str, item: WireItem) -> None:
         """Take an item of the wire, from any thread."""
         if isinstance(item, bytes):
-            kind, is_steady = kind_of(item), True
+            kind = kind_of(item)
             if kind in (Kind.SIGN, Kind.MEETING):
                 item, section = split_clocks(item)
-                is_steady = not section or self.clocks.arrive(link, section)
-            if kind is Kind.SIGN and is_steady and self._resting.get(link) == item:
+                if section:
+                    self.clocks.arrive(link, section)
+            if kind is Kind.SIGN and self._resting.get(link) == item:
                 return
             urgent = kind in _URGENT
             received = Received(link, item, len(item), kind is Kind.LIVE, urgent, kind in _FOLLOWS)
