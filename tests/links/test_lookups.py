@@ -307,6 +307,7 @@ in_simulated_time = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.every_loop
 @in_simulated_time
 async def test_a_long_wait_is_asked_for_in_parts() -> None:
     async with asked() as scene, anyio.create_task_group() as tasks:
@@ -319,8 +320,18 @@ async def test_a_long_wait_is_asked_for_in_parts() -> None:
             await scene.lookup("map", "nothing", timeout=25.0)
         assert late.value.timeout == 25.0
         assert isinstance(late.value.__cause__, UnknownFrameError)
+        # No asker makes the server wait longer than ten seconds.
+        stranger = Stranger(scene.network, "r3")
+        await stranger.open()
+        for number, timeout in enumerate((None, 1e6, math.nan)):
+            question = RemoteQuestion("map", "nothing", LATEST, timeout=timeout)
+            stranger.say(scene.link.id, Kind.LOOKUP, number.to_bytes(8, "little") + write_question(question))
+        await until(lambda: scene.server.statistics().waiting == 3)
+        await anyio.sleep(10.1)
+        assert len(stranger.bodies) == 3
 
 
+@pytest.mark.every_loop
 @in_simulated_time
 @pytest.mark.parametrize(("timeout", "waited"), [(None, 3.0), (2.0, 2.0), (30.0, 3.0)])
 async def test_a_server_is_waited_for_three_seconds_at_most(timeout: float | None, waited: float) -> None:
@@ -331,6 +342,7 @@ async def test_a_server_is_waited_for_three_seconds_at_most(timeout: float | Non
         assert anyio.current_time() - began == pytest.approx(waited)
 
 
+@pytest.mark.every_loop
 @in_simulated_time
 @pytest.mark.parametrize("lost", [Kind.LOOKUP, Kind.LOOKUP_ANSWER])
 async def test_what_is_dropped_is_asked_again_and_a_silent_server_is_given_up(lost: Kind) -> None:
@@ -350,12 +362,16 @@ async def test_what_is_dropped_is_asked_again_and_a_silent_server_is_given_up(lo
 
         scene.network.lose = lose(2)
         assert (await scene.lookup("map", "base")).static
-        for timeout in (None, 2.0):
+        # A server waits for ten seconds at most, its answer comes within three more, and it is asked four times.
+        for timeout, given_up in ((None, 4 * 13.0), (2.0, 2.0 + 3.0)):
             dropped.clear()
+            began = anyio.current_time()
             scene.network.lose = lose(100)
             with pytest.raises(RemoteLookupError) as silent:
                 await scene.lookup("map", "base", timeout=timeout)
             assert silent.value.reason == "silent"
+            waited = given_up if lost is Kind.LOOKUP_ANSWER else 0.0
+            assert anyio.current_time() - began == pytest.approx(waited)
             scene.network.lose = lose(0)
 
 
