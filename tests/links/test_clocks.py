@@ -258,6 +258,7 @@ def test_corrected_samples_of_near_and_far_buses_are_stamped_as_if_there_were_on
     far, middle = SkewedClock(world, 3600.0, 100e-6), SkewedClock(world, -0.3)
     here = world.process(first, clock=SkewedClock(world), correct_clocks=True)
     bridge = world.process(first, second, clock=middle, correct_clocks=True)
+    slow = world.process(first, clock=SkewedClock(world), correct_clocks=True, robots={"*": 5.0})
     there = world.process(second, clock=far)
     second.delay = first.delay
     sends = (bridge, "near", middle), (there, "far", far)
@@ -269,6 +270,8 @@ def test_corrected_samples_of_near_and_far_buses_are_stamped_as_if_there_were_on
                 at = world.now - back
                 found = buffer.lookup_nowait("map", frame, round(at * SECOND)).transform.translation[0]
                 assert found == pytest.approx(at, abs=0.001)
+            newest = slow.frames[frame]
+            assert newest.transform.translation[0] == pytest.approx(newest.stamp / SECOND, abs=0.001)
     # The bridge has corrected its own copy, and passed on what it got.
     assert bridge.frames["far"].stamp == pytest.approx((world.now - 0.3 - 0.1) * SECOND, abs=2_000_000)
 

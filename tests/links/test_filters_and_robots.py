@@ -92,13 +92,15 @@ def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_th
     world = World()
     network = Network(world)
     one = world.process(network)
-    many = []
-    for number in range(MOST_FILTERS + 5):
-        some = [f"f{number}"]
-        many.append(Stranger(network, channel=filter_name(some)))
+
+    def hear(frame: str) -> Stranger:
+        hearer = Stranger(network, channel=filter_name([frame]))
         world.run(0.01)
-        many[-1].send(one.wire.id, write_text(Kind.QUESTION, {"since": 0, "frames": some}))
+        hearer.send(one.wire.id, write_text(Kind.QUESTION, {"since": 0, "frames": [frame]}))
         world.run(0.1)
+        return hearer
+
+    many = [hear(f"f{number}") for number in range(MOST_FILTERS + 5)]
     long = world.process(network, frames=[f"{number}{'x' * 900}" for number in range(LONGEST_FILTER // 900)] + ["f0"])
     world.run(1.0)
     for stamp in range(3):
@@ -109,6 +111,14 @@ def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_th
         assert [sample.stamp for sample in samples if sample.child == f"f{number}"] == [0, 1, 2]
         assert len(samples) == (3 if number < MOST_FILTERS else 3 * len(many))
     assert counts(long) == {"f0": 3}
+    # Filters without hearers make room.
+    for hearer in many:
+        network.remove(hearer)
+    world.run(60.0)
+    late = hear("late")
+    one.say(moving("map", "late", 3), moving("map", "f0", 3))
+    world.run(0.1)
+    assert [sample.child for message in late.heard(Kind.LIVE) for sample in read_live(message)] == ["late"]
 
 
 def test_a_link_for_no_frame_at_all_hears_and_sends_nothing(world: World, network: Network) -> None:
@@ -161,6 +171,45 @@ def test_of_a_slow_robot_come_static_frames_at_once_and_the_newest_of_moving_one
     world.run(5.0)
     assert "base" not in slow.frames
     assert slow.end.lost == 0
+
+
+def test_a_slow_hearer_is_sent_the_last_moving_sample_of_each_frame_that_is_still_there(
+    world: World, network: Network
+) -> None:
+    robot, hearer = world.process(network, slow_rate=5.0), Stranger(network, channel="slow")
+    world.run(1.0)
+    robot.say(*(moving("map", frame, 1) for frame in "abcd"))
+    robot.say(moving("map", "a", 2), static("map", "b"))
+    robot.remove("c")
+    world.run(1.0)
+    assert [[(s.child, s.stamp) for s in read_live(message)] for message in hearer.heard(Kind.LIVE)] == [
+        [("d", 1), ("a", 2)]
+    ]
+    # What waits for a hearer that has gone is not kept for another.
+    robot.say(moving("map", "a", 3))
+    network.remove(hearer)
+    robot.say(moving("map", "a", 4))
+    late = Stranger(network, channel="slow")
+    world.run(1.0)
+    assert late.heard(Kind.LIVE) == []
+
+
+@pytest.mark.parametrize(("rate", "turns"), [(float("inf"), 3), (2.0, 13)])
+def test_a_link_at_rest_sends_no_samples_and_has_few_turns(
+    world: World, network: Network, rate: float, turns: int
+) -> None:
+    robot = world.process(network, robot="r1", slow_rate=5.0)
+    world.process(network, robots={"r1": rate})
+    world.run(1.0)
+    robot.say(moving("map", "base", 1))
+    world.run(30.0)
+    network.sent()
+    due = set()
+    for _ in range(200):
+        world.run(0.01)
+        due.add(robot.due)
+    assert len(due) <= turns
+    assert network.sent(Kind.LIVE) == 0
 
 
 def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer(world: World, network: Network) -> None:
