@@ -203,7 +203,8 @@ async def test_the_end_of_an_asker_ends_its_lookups_here_and_there_and_no_others
     async with asked() as scene, anyio.create_task_group() as tasks:
         stays = Asked(tasks, lambda: scene.lookup("map", "base"))
         with Bus() as bus:
-            async with DomainLink(bus, "tf", scene.network.wire()) as other:
+            # Which is another link of the robot.
+            async with DomainLink(bus, "tf", scene.network.wire("r1"), robot="r1") as other:
                 ends = Asked(tasks, lambda: other.lookup("map", "base", robot="r1"))
                 await until(lambda: scene.server.statistics().waiting == 2)
             with pytest.raises(RuntimeError, match="not entered"):
@@ -335,11 +336,28 @@ async def test_a_long_wait_is_asked_for_in_parts() -> None:
 @in_simulated_time
 @pytest.mark.parametrize(("timeout", "waited"), [(None, 3.0), (2.0, 2.0), (30.0, 3.0)])
 async def test_a_server_is_waited_for_three_seconds_at_most(timeout: float | None, waited: float) -> None:
-    async with DomainLink(Bus(), "tf", MemoryNetwork().wire()) as asker:
+    # The server of another robot has come before.
+    async with asked() as scene:
+        scene.bus.publish(static("map", "base"))
+        await scene.lookup("map", "base")
         began = anyio.current_time()
         with pytest.raises(RemoteLookupError, match="nobody offers it"):
-            await asker.lookup("map", "base", timeout=timeout)
+            await scene.asker.lookup("map", "base", timeout=timeout)
         assert anyio.current_time() - began == pytest.approx(waited)
+
+
+@pytest.mark.every_loop
+@in_simulated_time
+async def test_a_lookup_that_waits_for_a_server_ends_with_its_link() -> None:
+    async with anyio.create_task_group() as tasks:
+        async with DomainLink(Bus(), "tf", MemoryNetwork().wire()) as asker:
+            waiting = Asked(tasks, lambda: asker.lookup("map", "base"))
+            await settle()
+            began = anyio.current_time()
+        await until(lambda: waiting.ended)
+    assert isinstance(waiting.error, RemoteLookupError)
+    assert waiting.error.reason == "lost"
+    assert anyio.current_time() - began < 1.0
 
 
 @pytest.mark.every_loop
@@ -404,7 +422,7 @@ QUESTION = RemoteQuestion("map", "base", LATEST)
 
 @pytest.mark.parametrize(
     "answer",
-    [b"garbage", b"[]", b"{}", b"[" * 60_000, write_answer(FOUND.replace(child="arm")), b'{"type": "RecordingError"}'],
+    [b"", b"garbage", b"[]", b"{}", b"[" * 60_000, write_answer(FOUND.replace(child="arm")), b'{"type": "RecordingError"}'],
 )
 async def test_whatever_a_server_answers_a_lookup_has_its_answer_or_a_remote_lookup_error(answer: bytes) -> None:
     network = MemoryNetwork()
@@ -418,10 +436,12 @@ async def test_whatever_a_server_answers_a_lookup_has_its_answer_or_a_remote_loo
             number = stranger.bodies[0][1][:8]
             # Others cannot answer, nor can an answer to another question.
             other.say(asker.id, Kind.LOOKUP_ANSWER, number + write_answer(FOUND))
-            stranger.say(asker.id, Kind.LOOKUP_ANSWER, bytes(8) + write_answer(FOUND))
+            for never in (bytes(8), b"\xff" * 8):
+                stranger.say(asker.id, Kind.LOOKUP_ANSWER, never + write_answer(FOUND))
             stranger.say(asker.id, Kind.LOOKUP_ANSWER, b"")
             await settle()
             assert not waiting.ended
+            assert asker.statistics().rejected == {"lookup": 3}
             stranger.say(asker.id, Kind.LOOKUP_ANSWER, number + answer)
             await until(lambda: waiting.ended)
             assert isinstance(waiting.error, RemoteLookupError)

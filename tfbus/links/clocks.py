@@ -178,7 +178,6 @@ class ClockFilter:
         best = self._best
         if best is not None and abs(best.ahead - ahead) > best.bound_at(found.at) + found.bound:
             self._exchanges.clear()
-            self._steady = None
         self._exchanges.append(found)
         self._best = min(self._exchanges, key=lambda one: one.bound_at(arrived))
 
@@ -225,7 +224,7 @@ class ClockFilter:
                 # A clock was set: earlier exchanges do not show its drift.
                 recent.clear()
             recent.append(one)
-        if len(recent) < 3 or recent[-1].at - recent[0].at < _SHORTEST_FIT:
+        if recent[-1].at - recent[0].at < _SHORTEST_FIT:
             return None
         weights = [1.0 / one.bound**2 for one in recent]
         first = recent[0]
@@ -270,9 +269,7 @@ def read_section(section: bytes, reader: bytes) -> Section:
     end = len(section) - _END.size
     steady, base, _ = _END.unpack_from(section, end)
     place = section.find(reader)
-    while place >= 0 and place % _ECHO.size:
-        place = section.find(reader, place + 1)
-    echo = _ECHO.unpack_from(section, place)[1:] if 0 <= place < end else None
+    echo = _ECHO.unpack_from(section, place)[1:] if 0 <= place <= end - _ECHO.size else None
     return Section(steady, None if base == _NO_BASE else base, echo)
 
 
@@ -367,7 +364,7 @@ class Clocks:
             echoes.append((bytes.fromhex(link[:16]), steady, arrived))
         return write_section(self.own.steady(), self.own.base(), echoes)
 
-    def place(self, link: str, told: int | None, *, direct: bool) -> tuple[int | None, int]:
+    def place(self, link: str, told: int | None) -> tuple[int | None, int]:
         """The base of the clock of a batch against the own steady clock, and what to add to its stamps, in ns.
 
         Parameters
@@ -376,14 +373,10 @@ class Clocks:
             The peer that has sent the batch.
         told : int or None
             The base that it tells, against its own steady clock.
-        direct : bool
-            Whether the clock is that of the peer's own bus.
         """
         peer = self._peers.get(link)
         if peer is None or told is None:
             return None, 0
-        if direct:
-            peer.base = told
         ahead = peer.smoothly_ahead(self.own.steady())
         if ahead is None or abs(told + ahead) > _LARGEST:
             return None, 0
@@ -455,7 +448,6 @@ class Clocks:
 
     def statistics(self, peers: Iterable[tuple[str, Iterable[str]]]) -> tuple[PeerClock, ...]:
         """The clocks of some peers, each given by its id and its authorities."""
-        self.settle()
         own, now = self.own.base(), self.own.steady()
         return tuple(
             self._peers[link].statistics(link, tuple(sorted(authorities)), own, now)

@@ -432,13 +432,13 @@ class DomainEnd(Endpoint):
         if source.clock is not None:
             return False
         moving = [sample for sample in entry.samples if not sample.static]
-        self._correct(peer, source, moving, direct=entry.origin == heard.bus)
+        self._correct(peer, source, moving)
         is_live = heard.kind is Kind.LIVE and bool(moving)
         return is_live and self.clocks.jumps(peer.id, entry.origin, entry.clock, source.clock, source.shift)
 
-    def _correct(self, peer: Peer, source: Provenance, moving: Sequence[FromLink], *, direct: bool = False) -> None:
+    def _correct(self, peer: Peer, source: Provenance, moving: Sequence[FromLink]) -> None:
         """Find the clock of a source, and if stamps are to be corrected, move those of its samples, which are new."""
-        source.clock, shift = self.clocks.place(peer.id, source.told, direct=direct)
+        source.clock, shift = self.clocks.place(peer.id, source.told)
         if shift and all(FIRST_STAMP <= sample.stamp + shift < END_OF_STAMPS for sample in moving):
             source.shift = shift
             for sample in moving:

@@ -18,8 +18,8 @@ from tfbus.stamps import from_seconds
 from tfbus.tree.history import samples_of
 
 CHUNK = 2_000
-"""The most samples in one answer, unless a single frame has more."""
-MOST_OF_FRAME = 2_000
+"""The most samples in one answer."""
+MOST_OF_FRAME = CHUNK
 """The most samples of one frame in an answer, the newest."""
 LONGEST_HISTORY = 3_600.0
 """s."""
@@ -46,14 +46,13 @@ def chunk_of_past(bus: Bus, brought: Iterable[Known], seconds: float, after: str
     after : str
         The chunk begins with the first frame whose name comes after this one.
     """
-    moving = [known for known in brought if known.frame > after and known.sample and not known.sample.static]
     told: list[OutgoingBatch] = []
     count = 0
-    for known in sorted(moving, key=lambda known: known.frame):
+    for known in sorted((known for known in brought if known.frame > after), key=lambda known: known.frame):
         samples = _recent(bus, known.frame, seconds)
         if not samples:
             continue
-        if told and count + len(samples) > CHUNK:
+        if count + len(samples) > CHUNK:
             return told, False
         source = known.source
         told.append(OutgoingBatch(source.origin, source.sequence, samples, source.clock, source.shift))
