@@ -166,6 +166,11 @@ def test_what_was_held_back_comes_when_the_peer_says_nothing_leaves_or_sends_too
         case "silence":
             world.run(PATIENCE)
         case "answer":
+            # Each answer may take so long.
+            for frame in ("a", "b"):
+                world.run(PATIENCE - 1.0)
+                other = peer.batch(moving("map", frame, 0), number=9)
+                peer.say(other, kind=Kind.PAST, claim=Claim(0, 0, 0, final=False))
             peer.say(past, kind=Kind.PAST)
         case "garbage":
             peer.say(peer.batch(moving("map", "base", 0), number=2**64 - 1), kind=Kind.PAST)
@@ -177,14 +182,33 @@ def test_what_was_held_back_comes_when_the_peer_says_nothing_leaves_or_sends_too
             for _ in range(2):
                 peer.say(past, kind=Kind.PAST, claim=Claim(0, 0, 0, final=False))
             assert len(peer.heard(Kind.PAST_QUESTION)) == 2
-    heard = [sample.stamp for sample in late.seen]
+    heard = [sample.stamp for sample in late.seen if sample.child == "base"]
     expected = list(range(MOST_HELD + 2 if end == "many" else 3))
     if end == "many":
-        # The end of it came live; the rest when the past does not come.
-        world.run(PATIENCE)
+        # The end of it came live; the rest with an answer, and then no more is asked for.
+        peer.say(past, kind=Kind.PAST, claim=Claim(0, 0, 0, final=False))
+        assert len(peer.heard(Kind.PAST_QUESTION)) == 1
         heard = sorted(sample.stamp for sample in late.seen)
     assert heard == ([0] if end in ("answer", "same again") else []) + expected
     assert late.end.rejected.keys() <= {"number"}
+
+
+def test_so_many_samples_wait_for_the_past_of_all_peers_together() -> None:
+    world = World()
+    network = Network(world)
+    late = world.process(network, history=5.0)
+    # What has waited for some peers makes room for that of others.
+    for _ in range(2):
+        shown = len(late.seen)
+        peers = [Stranger(network), Stranger(network)]
+        world.run(0.01)
+        for peer in peers:
+            for _ in range(3):
+                # A removal counts as two, and a large message is held in parts.
+                peer.say(*[peer.removal("none")] * 9_000)
+            peer.say(peer.batch(*(moving("map", peer.id, stamp) for stamp in range(500))))
+        assert {sample.child for sample in late.seen[shown:]} == {peers[1].id}
+        world.run(PATIENCE)
 
 
 def test_it_has_to_be_a_time_that_passes() -> None:

@@ -422,7 +422,15 @@ QUESTION = RemoteQuestion("map", "base", LATEST)
 
 @pytest.mark.parametrize(
     "answer",
-    [b"", b"garbage", b"[]", b"{}", b"[" * 60_000, write_answer(FOUND.replace(child="arm")), b'{"type": "RecordingError"}'],
+    [
+        b"",
+        b"garbage",
+        b"[]",
+        b"{}",
+        b"[" * 60_000,
+        write_answer(FOUND.replace(child="arm")),
+        b'{"type": "RecordingError"}',
+    ],
 )
 async def test_whatever_a_server_answers_a_lookup_has_its_answer_or_a_remote_lookup_error(answer: bytes) -> None:
     network = MemoryNetwork()
