@@ -360,8 +360,11 @@ class DomainEnd(Endpoint):
                     return
             if heard.kind is not Kind.SIGN:
                 self.messages += 1
-        if heard.kind is Kind.LIVE and sender in self._history.open and self._history.holds(sender, heard):
-            return
+        if heard.kind is Kind.LIVE and sender in self._history.open:
+            if self._history.holds(sender, heard):
+                return
+            # A later message would make those that were held back no news.
+            self._end_history(peer)
         self._take_held(peer, heard)
 
     def _take_held(self, peer: Peer, heard: Heard) -> None:

@@ -24,9 +24,9 @@ MOST_OF_FRAME = CHUNK
 LONGEST_HISTORY = 3_600.0
 """s."""
 MOST_HELD = 1_000
-"""The most live messages of one peer that wait for its past; then the link asks the peer for no more."""
+"""The most live messages of one peer that wait for its past; with more, the link waits no longer."""
 MOST_HELD_SAMPLES = 100_000
-"""The most samples and removals in the waiting messages of all peers together; further messages do not wait."""
+"""The most samples and removals in the waiting messages of all peers together; with more, a peer is waited for no longer."""
 PATIENCE = 5.0
 """s; the longest wait for one answer."""
 MOST_REMEMBERED = 10_000
@@ -128,7 +128,7 @@ class HistoryAsker:
             return False
         batches = (entry for entry in message.entries if isinstance(entry, ReceivedBatch))
         last = max((sample.child for batch in batches for sample in batch.samples), default="")
-        if last <= waiting.after or len(waiting.held) >= MOST_HELD:
+        if last <= waiting.after:
             return False
         self._ask(peer, last)
         return True
