@@ -71,6 +71,9 @@ def test_a_link_for_some_frames_sends_and_takes_these_only_and_peers_send_it_no_
     assert one.frames.keys() == {"arm", "base", "own"}
     assert some.end.messages - before <= 25
     assert (some.end.lost, some.end.rejected) == (0, {})
+    network.sent()
+    world.run(20.0)
+    assert network.sent(Kind.QUESTION) == 0
 
 
 @pytest.mark.parametrize("how_many", [1, 3])
@@ -96,12 +99,16 @@ def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_th
     def hear(frame: str) -> Stranger:
         hearer = Stranger(network, channel=filter_name([frame]))
         world.run(0.01)
-        hearer.send(one.wire.id, write_text(Kind.QUESTION, {"since": 0, "frames": [frame]}))
-        world.run(0.1)
+        for _ in range(2):
+            hearer.send(one.wire.id, write_text(Kind.QUESTION, {"since": 0, "frames": [frame]}))
+            world.run(0.1)
         return hearer
 
     many = [hear(f"f{number}") for number in range(MOST_FILTERS + 5)]
-    long = world.process(network, frames=[f"{number}{'x' * 900}" for number in range(LONGEST_FILTER // 900)] + ["f0"])
+    long = world.process(
+        network, frames=[f"{number}{'x' * 900}" for number in range(LONGEST_FILTER // 900 + 1)] + ["f0"]
+    )
+    another = world.process(network, frames=["f0", "f1"])
     world.run(1.0)
     for stamp in range(3):
         one.say(*(moving("map", f"f{number}", stamp) for number in range(len(many))))
@@ -111,10 +118,17 @@ def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_th
         assert [sample.stamp for sample in samples if sample.child == f"f{number}"] == [0, 1, 2]
         assert len(samples) == (3 if number < MOST_FILTERS else 3 * len(many))
     assert counts(long) == {"f0": 3}
+    assert counts(another) == {"f0": 3, "f1": 3}
     # Filters without hearers make room.
     for hearer in many:
         network.remove(hearer)
     world.run(60.0)
+    # Signs show what was missed to those that had no room, too.
+    network.loss = 1.0
+    one.say(moving("map", "f1", 3))
+    network.loss = 0.0
+    world.run(60.0)
+    assert another.frames["f1"].stamp == 3
     late = hear("late")
     one.say(moving("map", "late", 3), moving("map", "f0", 3))
     world.run(0.1)

@@ -26,7 +26,7 @@ LONGEST_HISTORY = 3_600.0
 MOST_HELD = 1_000
 """The most live messages of one peer that wait for its past; with more, the link waits no longer."""
 MOST_HELD_SAMPLES = 100_000
-"""The most samples and removals in the waiting messages of all peers together; with more, a peer is waited for no longer."""
+"""The most samples and removals in the waiting messages of all peers together; with more, the link waits no longer."""
 PATIENCE = 5.0
 """s; the longest wait for one answer."""
 MOST_REMEMBERED = 10_000
