@@ -199,7 +199,7 @@ def test_a_slow_hearer_is_sent_the_last_moving_sample_of_each_frame_that_is_stil
     assert [[(s.child, s.stamp) for s in read_live(message)] for message in hearer.heard(Kind.LIVE)] == [
         [("d", 1), ("a", 2)]
     ]
-    # What waits for a hearer that has gone is not kept for another.
+    # A later hearer gets no samples that waited for one that has gone.
     robot.say(moving("map", "a", 3))
     network.remove(hearer)
     robot.say(moving("map", "a", 4))

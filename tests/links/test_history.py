@@ -194,7 +194,7 @@ def test_so_many_samples_wait_for_the_past_of_all_peers_together() -> None:
     world = World()
     network = Network(world)
     late = world.process(network, history=5.0)
-    # What has waited for some peers makes room for that of others.
+    # The messages of earlier peers have made room for those of later ones.
     for _ in range(2):
         shown = len(late.seen)
         peers = [Stranger(network), Stranger(network)]
