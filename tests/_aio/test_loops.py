@@ -1,19 +1,26 @@
 """Waking a loop from threads, letting all tasks settle, and waiting for the ends of threads and task groups."""
 
 import asyncio
+import gc
+import queue
 import threading
 import types
-from collections.abc import Awaitable, Callable, Coroutine, Generator
+import weakref
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Generator
+from contextlib import suppress
+from functools import partial
 from threading import Event, Thread
 from typing import Any
 
 import anyio
 import anyio.lowlevel
 import anyio.to_thread
+import outcome
 import pytest
+import trio
 from support.asking import settle
 
-from tfbus._aio.loops import LoopWaker, join_all, settling, wait_for_all
+from tfbus._aio.loops import LoopWaker, asleep, join_all, running_loop, settling, wait_for_all, wake_up
 from tfbus._aio.task_groups import close_task_group
 from tfbus._aio.turn_budget import TurnBudget
 
@@ -58,6 +65,82 @@ async def test_requests_of_work_on_the_loop_are_answered_at_its_end_and_later_on
     assert len(done) == 3
     await settle()
     assert len(done) == 4
+
+
+async def test_a_callback_that_wakes_again_is_called_again_and_gives_tasks_their_turn() -> None:
+    calls: list[None] = []
+
+    def call() -> None:
+        calls.append(None)
+        if len(calls) < 100:
+            waker.wake()
+
+    waker = LoopWaker(call)
+    waker.bind()
+    waker.wake()
+    for _ in range(5):
+        await anyio.lowlevel.checkpoint()
+    assert 1 < len(calls) < 100
+
+
+def test_a_request_is_answered_though_the_loop_ends_and_the_loop_is_not_kept(run: Run) -> None:
+    answers: list[int] = []
+    loops: list[weakref.ref[object]] = []
+
+    async def serve() -> None:
+        loops.append(weakref.ref(running_loop()))
+        for number in range(2):
+            waker = LoopWaker(partial(answers.append, number))
+            waker.bind()
+            waker.wake()
+
+    run(serve)
+    assert answers == [0, 1]
+    gc.collect()
+    assert loops[0]() is None
+
+
+def test_a_request_is_answered_while_trio_ends_and_where_it_is_the_guest_of_another_loop() -> None:
+    answers: list[None] = []
+    woken = trio.Event()
+    guest, end = LoopWaker(woken.set), LoopWaker(partial(answers.append, None))
+    turns: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+    outcomes: list[outcome.Outcome[None]] = []
+
+    async def late() -> AsyncIterator[None]:
+        try:
+            yield
+        finally:
+            # Trio ends it behind all tasks.
+            end.wake()
+
+    generator = late()
+
+    async def serve() -> None:
+        guest.bind()
+        end.bind()
+        await anext(generator)
+        # The host wakes it, outside of all tasks.
+        turns.put(guest.wake)
+        with trio.fail_after(PATIENCE):
+            await woken.wait()
+
+    trio.lowlevel.start_guest_run(serve, run_sync_soon_threadsafe=turns.put, done_callback=outcomes.append)
+    while not outcomes:
+        turns.get(timeout=PATIENCE)()
+    outcomes[0].unwrap()
+    assert answers == [None]
+
+
+async def test_a_sleep_that_was_cancelled_may_be_ended_afterwards() -> None:
+    sleep, end = wake_up(running_loop())
+    with anyio.CancelScope() as scope:
+        scope.cancel()
+        await asleep(sleep)
+    with suppress(Exception):
+        end()
+    await anyio.lowlevel.checkpoint()
+    assert scope.cancelled_caught
 
 
 def test_waking_in_a_thread_while_the_loop_ends_raises(run: Run) -> None:

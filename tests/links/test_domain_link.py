@@ -19,7 +19,7 @@ from support.samples import moving, static
 
 from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, TransformStamped
 from tfbus.links import BufferServer, DomainLink
-from tfbus.links.message import MAX_SAMPLES, Kind, Outgoing, kind_of, write_message
+from tfbus.links.message import MAX_SAMPLES, Heard, Kind, Outgoing, kind_of, read_message, write_message
 from tfbus.links.replica import OutgoingBatch
 from tfbus.links.seams import Hearing, Receive
 
@@ -369,7 +369,7 @@ async def test_what_no_message_can_hold_is_counted_and_logged_and_the_rest_goes_
 ) -> None:
     network = MemoryNetwork()
     with Bus(max_ahead=None) as here, Bus() as there:
-        async with DomainLink(here, "tf", network.wire()) as link, DomainLink(there, "tf", network.wire()):
+        async with DomainLink(here, "tf", network.wire()) as link, DomainLink(there, "tf", network.wire()) as other:
             await until(lambda: bool(link.peers))
             for _ in range(2):
                 here.publish([moving("map", "far", 2**62), moving("map", "a", 1), moving("map", "x" * 1_025, 1)])
@@ -378,11 +378,14 @@ async def test_what_no_message_can_hold_is_counted_and_logged_and_the_rest_goes_
             await until(lambda: there.statistics().frames == 1)
             assert link.statistics().not_sent == {"stamp": 2, "frame name": 3, "authority": 2}
             # All together are too large for one message.
-            long = "x" * 1_000
+            messages, long = live_messages(network), "x" * 1_000
             here.publish([moving("map", f"{n}{long}", 1) for n in range(3)])
             for n in range(3_000):
                 here.publish(static(f"{n}{long}", f"{n}{long}s"))
             await until(lambda: there.statistics().frames == 3_004)
+            parts = [part for message in messages for part in read_message(message) if isinstance(part, Heard)]
+            assert sum(len(part.entries) for part in parts) == 3_001
+            assert (len(messages) > 1, other.statistics().lost) == (True, 0)
             assert link.statistics().not_sent == {"stamp": 2, "frame name": 3, "authority": 2}
     assert sum("not sent over the link tf" in message for message in caplog.messages) <= 6
 

@@ -72,6 +72,9 @@ def test_a_link_for_some_frames_sends_and_takes_these_only_and_peers_send_it_no_
     assert one.frames.keys() == {"arm", "base", "own"}
     assert some.end.messages - before <= 25
     assert (some.end.lost, some.end.rejected) == (0, {})
+    network.sent()
+    world.run(20.0)
+    assert network.sent(Kind.QUESTION) == 0
 
 
 @pytest.mark.parametrize("how_many", [1, 3])
@@ -93,14 +96,20 @@ def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_th
     world = World()
     network = Network(world)
     one = world.process(network)
-    many = []
-    for number in range(MOST_FILTERS + 5):
-        some = [f"f{number}"]
-        many.append(Stranger(network, channel=filter_name(some)))
+
+    def hear(frame: str) -> Stranger:
+        hearer = Stranger(network, channel=filter_name([frame]))
         world.run(0.01)
-        many[-1].send(one.wire.id, write_text(Kind.QUESTION, {"since": 0, "frames": some}))
-        world.run(0.1)
-    long = world.process(network, frames=[f"{number}{'x' * 900}" for number in range(LONGEST_FILTER // 900)] + ["f0"])
+        for _ in range(2):
+            hearer.send(one.wire.id, write_text(Kind.QUESTION, {"since": 0, "frames": [frame]}))
+            world.run(0.1)
+        return hearer
+
+    many = [hear(f"f{number}") for number in range(MOST_FILTERS + 5)]
+    long = world.process(
+        network, frames=[f"{number}{'x' * 900}" for number in range(LONGEST_FILTER // 900 + 1)] + ["f0"]
+    )
+    another = world.process(network, frames=["f0", "f1"])
     world.run(1.0)
     for stamp in range(3):
         one.say(*(moving("map", f"f{number}", stamp) for number in range(len(many))))
@@ -110,6 +119,21 @@ def test_more_filters_than_are_served_and_names_that_are_too_long_still_bring_th
         assert [sample.stamp for sample in samples if sample.child == f"f{number}"] == [0, 1, 2]
         assert len(samples) == (3 if number < MOST_FILTERS else 3 * len(many))
     assert counts(long) == {"f0": 3}
+    assert counts(another) == {"f0": 3, "f1": 3}
+    # Filters without hearers make room.
+    for hearer in many:
+        network.remove(hearer)
+    world.run(60.0)
+    # Signs show what was missed to those that had no room, too.
+    network.loss = 1.0
+    one.say(moving("map", "f1", 3))
+    network.loss = 0.0
+    world.run(60.0)
+    assert another.frames["f1"].stamp == 3
+    late = hear("late")
+    one.say(moving("map", "late", 3), moving("map", "f0", 3))
+    world.run(0.1)
+    assert [sample.child for message in late.heard(Kind.LIVE) for sample in read_live(message)] == ["late"]
 
 
 def test_who_meets_a_link_with_names_that_are_too_long_has_its_static_frames_soon(
@@ -210,6 +234,45 @@ def test_a_message_of_newest_samples_is_taken_or_left_out_as_a_whole_however_lon
         world.run(0.8)
     assert set(counts(board).values()) == {3}
     assert len(board.frames) == 1_000
+
+
+def test_a_slow_hearer_is_sent_the_last_moving_sample_of_each_frame_that_is_still_there(
+    world: World, network: Network
+) -> None:
+    robot, hearer = world.process(network, slow_rate=5.0), Stranger(network, channel="slow")
+    world.run(1.0)
+    robot.say(*(moving("map", frame, 1) for frame in "abcd"))
+    robot.say(moving("map", "a", 2), static("map", "b"))
+    robot.remove("c")
+    world.run(1.0)
+    assert [[(s.child, s.stamp) for s in read_live(message)] for message in hearer.heard(Kind.LIVE)] == [
+        [("d", 1), ("a", 2)]
+    ]
+    # A later hearer gets no samples that waited for one that has gone.
+    robot.say(moving("map", "a", 3))
+    network.remove(hearer)
+    robot.say(moving("map", "a", 4))
+    late = Stranger(network, channel="slow")
+    world.run(1.0)
+    assert late.heard(Kind.LIVE) == []
+
+
+@pytest.mark.parametrize(("rate", "turns"), [(float("inf"), 3), (2.0, 13)])
+def test_a_link_at_rest_sends_no_samples_and_has_few_turns(
+    world: World, network: Network, rate: float, turns: int
+) -> None:
+    robot = world.process(network, robot="r1", slow_rate=5.0)
+    world.process(network, robots={"r1": rate})
+    world.run(1.0)
+    robot.say(moving("map", "base", 1))
+    world.run(30.0)
+    network.sent()
+    due = set()
+    for _ in range(200):
+        world.run(0.01)
+        due.add(robot.due)
+    assert len(due) <= turns
+    assert network.sent(Kind.LIVE) == 0
 
 
 def test_of_a_robot_of_rate_0_nothing_comes_but_it_is_a_peer(world: World, network: Network) -> None:

@@ -205,7 +205,8 @@ async def test_the_end_of_an_asker_ends_its_lookups_here_and_there_and_no_others
     async with asked() as scene, anyio.create_task_group() as tasks:
         stays = Asked(tasks, lambda: scene.lookup("map", "base"))
         with Bus() as bus:
-            async with DomainLink(bus, "tf", scene.network.wire()) as other:
+            # Which is another link of the robot.
+            async with DomainLink(bus, "tf", scene.network.wire("r1"), robot="r1") as other:
                 ends = Asked(tasks, lambda: other.lookup("map", "base", robot="r1"))
                 await until(lambda: scene.server.statistics().waiting == 2)
             with pytest.raises(RuntimeError, match="not entered"):
@@ -309,6 +310,7 @@ in_simulated_time = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.every_loop
 @in_simulated_time
 async def test_a_long_wait_is_asked_for_in_parts() -> None:
     async with asked() as scene, anyio.create_task_group() as tasks:
@@ -321,8 +323,18 @@ async def test_a_long_wait_is_asked_for_in_parts() -> None:
             await scene.lookup("map", "nothing", timeout=25.0)
         assert late.value.timeout == 25.0
         assert isinstance(late.value.__cause__, UnknownFrameError)
+        # No asker makes the server wait longer than ten seconds.
+        stranger = Stranger(scene.network, "r3")
+        await stranger.open()
+        for number, timeout in enumerate((None, 1e6, math.nan)):
+            question = RemoteQuestion("map", "nothing", LATEST, timeout=timeout)
+            stranger.say(scene.link.id, Kind.LOOKUP, number.to_bytes(8, "little") + write_question(question))
+        await until(lambda: scene.server.statistics().waiting == 3)
+        await anyio.sleep(10.1)
+        assert len(stranger.bodies) == 3
 
 
+@pytest.mark.every_loop
 @in_simulated_time
 async def test_a_lookup_waits_for_a_server_whose_simulated_clock_stands_still() -> None:
     async with asked(SimulatedClock()) as scene, anyio.create_task_group() as tasks:
@@ -338,13 +350,31 @@ async def test_a_lookup_waits_for_a_server_whose_simulated_clock_stands_still() 
 @in_simulated_time
 @pytest.mark.parametrize(("timeout", "waited"), [(None, 3.0), (2.0, 2.0), (30.0, 3.0)])
 async def test_a_server_is_waited_for_three_seconds_at_most(timeout: float | None, waited: float) -> None:
-    async with DomainLink(Bus(), "tf", MemoryNetwork().wire()) as asker:
+    # The server of another robot has come before.
+    async with asked() as scene:
+        scene.bus.publish(static("map", "base"))
+        await scene.lookup("map", "base")
         began = anyio.current_time()
         with pytest.raises(RemoteLookupError, match="nobody offers it"):
-            await asker.lookup("map", "base", timeout=timeout)
+            await scene.asker.lookup("map", "base", timeout=timeout)
         assert anyio.current_time() - began == pytest.approx(waited)
 
 
+@pytest.mark.every_loop
+@in_simulated_time
+async def test_a_lookup_that_waits_for_a_server_ends_with_its_link() -> None:
+    async with anyio.create_task_group() as tasks:
+        async with DomainLink(Bus(), "tf", MemoryNetwork().wire()) as asker:
+            waiting = Asked(tasks, lambda: asker.lookup("map", "base"))
+            await settle()
+            began = anyio.current_time()
+        await until(lambda: waiting.ended)
+    assert isinstance(waiting.error, RemoteLookupError)
+    assert waiting.error.reason == "lost"
+    assert anyio.current_time() - began < 1.0
+
+
+@pytest.mark.every_loop
 @in_simulated_time
 @pytest.mark.parametrize("lost", [Kind.LOOKUP, Kind.LOOKUP_ANSWER])
 async def test_what_is_dropped_is_asked_again_and_a_silent_server_is_given_up(lost: Kind) -> None:
@@ -364,12 +394,16 @@ async def test_what_is_dropped_is_asked_again_and_a_silent_server_is_given_up(lo
 
         scene.network.lose = lose(2)
         assert (await scene.lookup("map", "base")).static
-        for timeout in (None, 2.0):
+        # A server waits for ten seconds at most, its answer comes within three more, and it is asked four times.
+        for timeout, given_up in ((None, 4 * 13.0), (2.0, 2.0 + 3.0)):
             dropped.clear()
+            began = anyio.current_time()
             scene.network.lose = lose(100)
             with pytest.raises(RemoteLookupError) as silent:
                 await scene.lookup("map", "base", timeout=timeout)
             assert silent.value.reason == "silent"
+            waited = given_up if lost is Kind.LOOKUP_ANSWER else 0.0
+            assert anyio.current_time() - began == pytest.approx(waited)
             scene.network.lose = lose(0)
 
 
@@ -402,7 +436,15 @@ QUESTION = RemoteQuestion("map", "base", LATEST)
 
 @pytest.mark.parametrize(
     "answer",
-    [b"garbage", b"[]", b"{}", b"[" * 60_000, write_answer(FOUND.replace(child="arm")), b'{"type": "RecordingError"}'],
+    [
+        b"",
+        b"garbage",
+        b"[]",
+        b"{}",
+        b"[" * 60_000,
+        write_answer(FOUND.replace(child="arm")),
+        b'{"type": "RecordingError"}',
+    ],
 )
 async def test_whatever_a_server_answers_a_lookup_has_its_answer_or_a_remote_lookup_error(answer: bytes) -> None:
     network = MemoryNetwork()
@@ -416,10 +458,12 @@ async def test_whatever_a_server_answers_a_lookup_has_its_answer_or_a_remote_loo
             number = stranger.bodies[0][1][:8]
             # Others cannot answer, nor can an answer to another question.
             other.say(asker.id, Kind.LOOKUP_ANSWER, number + write_answer(FOUND))
-            stranger.say(asker.id, Kind.LOOKUP_ANSWER, bytes(8) + write_answer(FOUND))
+            for never in (bytes(8), b"\xff" * 8):
+                stranger.say(asker.id, Kind.LOOKUP_ANSWER, never + write_answer(FOUND))
             stranger.say(asker.id, Kind.LOOKUP_ANSWER, b"")
             await settle()
             assert not waiting.ended
+            assert asker.statistics().rejected == {"lookup": 3}
             stranger.say(asker.id, Kind.LOOKUP_ANSWER, number + answer)
             await until(lambda: waiting.ended)
             assert isinstance(waiting.error, RemoteLookupError)

@@ -51,6 +51,7 @@ class SkewedClock(SystemClock):
         self._began = world.now
         self.ahead = ahead
         self.drift = drift
+        self.is_set = True
 
     def now(self) -> int:
         return round((self._world.now + self.offset) * SECOND)

@@ -108,7 +108,6 @@ class _TrioWakeUp:
     def _abort(self, _raise_cancel: object) -> Any:
         """End the wait, because trio has cancelled it."""
         self._task = None
-        self._ended = True
         return _lowlevel().Abort.SUCCEEDED
 
 
@@ -128,8 +127,8 @@ class _TrioCalls:
 
     def call_soon(self, function: Callable[[], object]) -> None:
         """Call a function in the next turn; it must not raise."""
-        # Code outside of all tasks cannot wake a task: at the end of trio, and beside it where it is a guest.
-        if self._ended or here.name is None:
+        # At the end of trio, generators are closed behind all tasks.
+        if self._ended:
             self._token.run_sync_soon(function)
         else:
             self._functions.append(function)

@@ -160,8 +160,6 @@ class ClockFilter:
         self._best: Exchange | None = None
         self.base: int | None = None
         self.told: float | None = None
-        # When a clock was set: earlier exchanges do not show its drift.
-        self._set_at: int | None = None
         self._steady: tuple[int, int] | None = None
 
     def note(self, sent: int, heard: int, answered: int, arrived: int, apart: int = 0) -> None:
@@ -180,19 +178,8 @@ class ClockFilter:
         best = self._best
         if best is not None and abs(best.ahead - ahead) > best.bound_at(found.at) + found.bound:
             self._exchanges.clear()
-            self._steady = None
         self._exchanges.append(found)
         self._best = min(self._exchanges, key=lambda one: one.bound_at(arrived))
-
-    def steps_to(self, base: int | None) -> bool:
-        """Whether a base of the peer's bus shows that its clock was set since it told the last one."""
-        # Read once: another thread may call this.
-        last = self.base
-        return base is not last if base is None or last is None else abs(base - last) > STEP
-
-    def was_set(self) -> None:
-        """Note that the clock of either bus was set: earlier exchanges no longer show its drift."""
-        self._set_at = self._exchanges[-1].at if self._exchanges else None
 
     def ahead(self, now: int) -> tuple[int, int] | None:
         """The lead of the peer's steady clock at a time of the own one, and the bound of the error, in ns."""
@@ -231,8 +218,13 @@ class ClockFilter:
 
     def _drift(self) -> float | None:
         """The slope of the offsets, least squares weighted by the bounds; None for too short a time."""
-        recent = [one for one in self._exchanges if self._set_at is None or one.at > self._set_at]
-        if len(recent) < 3 or recent[-1].at - recent[0].at < _SHORTEST_FIT:
+        recent: list[Exchange] = []
+        for one in self._exchanges:
+            if recent and abs(one.apart - recent[-1].apart) > _most_slewed(one.at - recent[-1].at):
+                # A clock was set: earlier exchanges do not show its drift.
+                recent.clear()
+            recent.append(one)
+        if recent[-1].at - recent[0].at < _SHORTEST_FIT:
             return None
         weights = [1.0 / one.bound**2 for one in recent]
         first = recent[0]
@@ -240,6 +232,11 @@ class ClockFilter:
         offsets = [float(one.ahead + one.apart - first.ahead - first.apart) for one in recent]
         variance, covariance = np.cov(times, offsets, ddof=0, aweights=weights)[0]
         return float(covariance / variance)
+
+
+def _most_slewed(time: int) -> int:
+    """The ns by which a base changes at most in some ns, if its clock is not set."""
+    return STEP + round(_SLEW_OF_BASE * time)
 
 
 class Section(NamedTuple):
@@ -272,9 +269,7 @@ def read_section(section: bytes, reader: bytes) -> Section:
     end = len(section) - _END.size
     steady, base, _ = _END.unpack_from(section, end)
     place = section.find(reader)
-    while place >= 0 and place % _ECHO.size:
-        place = section.find(reader, place + 1)
-    echo = _ECHO.unpack_from(section, place)[1:] if 0 <= place < end else None
+    echo = _ECHO.unpack_from(section, place)[1:] if 0 <= place <= end - _ECHO.size else None
     return Section(steady, None if base == _NO_BASE else base, echo)
 
 
@@ -321,17 +316,14 @@ class Clocks:
         self._peers: dict[str, ClockFilter] = {}
         self._echoes: dict[str, tuple[int, int]] = {}
         self._origins: dict[bytes, _Origin] = {}
-        self._own_base: int | None = None
         # The peers that were measured since `news` was called.
         self._news: set[str] = set()
 
-    def arrive(self, link: str, section: bytes) -> bool:
-        """Take the end of a sign, in any thread; returns whether it tells no step of the peer's clock."""
+    def arrive(self, link: str, section: bytes) -> None:
+        """Take the end of a sign, in any thread."""
         arrived, told = self.own.steady(), read_section(section, self._id)
         if link in self._arrived or len(self._arrived) < _MOST_ARRIVED:
             self._arrived[link] = told, arrived
-        peer = self._peers.get(link)
-        return peer is None or not peer.steps_to(told.base)
 
     def joined(self, link: str) -> None:
         """Begin to measure a peer; one whose id is not made of hexadecimal digits cannot be answered."""
@@ -342,24 +334,17 @@ class Clocks:
     def left(self, link: str) -> None:
         """Forget a peer."""
         self._peers.pop(link, None)
-        self._echoes.pop(link, None)
-        self._arrived.pop(link, None)
 
     def settle(self) -> None:
         """Read all that has arrived."""
         own = self.own.base()
-        if own is not None and self._own_base is not None and abs(own - self._own_base) > STEP:
-            self._news.update(self._peers)
-            for peer in self._peers.values():
-                peer.was_set()
-        self._own_base = own
         while self._arrived:
             link, ((steady, base, echo), arrived) = self._arrived.popitem()
             if link not in self._peers:
                 continue
             peer = self._peers[link]
             self._echoes[link] = steady, arrived
-            self._rebase(link, peer, base)
+            peer.base = base
             if echo is not None:
                 apart = 0 if base is None or own is None else base - own
                 peer.note(echo[0], echo[1], steady, arrived, apart)
@@ -379,7 +364,7 @@ class Clocks:
             echoes.append((bytes.fromhex(link[:16]), steady, arrived))
         return write_section(self.own.steady(), self.own.base(), echoes)
 
-    def place(self, link: str, told: int | None, *, direct: bool) -> tuple[int | None, int]:
+    def place(self, link: str, told: int | None) -> tuple[int | None, int]:
         """The base of the clock of a batch against the own steady clock, and what to add to its stamps, in ns.
 
         Parameters
@@ -388,14 +373,10 @@ class Clocks:
             The peer that has sent the batch.
         told : int or None
             The base that it tells, against its own steady clock.
-        direct : bool
-            Whether the clock is that of the peer's own bus.
         """
         peer = self._peers.get(link)
         if peer is None or told is None:
             return None, 0
-        if direct:
-            self._rebase(link, peer, told)
         ahead = peer.smoothly_ahead(self.own.steady())
         if ahead is None or abs(told + ahead) > _LARGEST:
             return None, 0
@@ -435,7 +416,7 @@ class Clocks:
                 self._origins[origin] = _Origin(link, told, clock, shift, now, now)
             return False
         step = 0 if told is None or before.told is None else told - before.told
-        moved, limit = shift - before.shift, STEP + _SLEW_OF_BASE * (now - before.at)
+        moved, limit = shift - before.shift, _most_slewed(now - before.at)
         before.told, before.clock, before.shift, before.at, before.placed = told, clock, shift, now, now
         before.step = step if abs(step) > limit else 0
         return abs(moved) > limit if self.corrects else bool(before.step)
@@ -472,16 +453,9 @@ class Clocks:
 
     def statistics(self, peers: Iterable[tuple[str, Iterable[str]]]) -> tuple[PeerClock, ...]:
         """The clocks of some peers, each given by its id and its authorities."""
-        self.settle()
         own, now = self.own.base(), self.own.steady()
         return tuple(
             self._peers[link].statistics(link, tuple(sorted(authorities)), own, now)
             for link, authorities in peers
             if link in self._peers
         )
-
-    def _rebase(self, link: str, peer: ClockFilter, base: int | None) -> None:
-        if peer.steps_to(base):
-            peer.was_set()
-            self._news.add(link)
-        peer.base = base

@@ -298,11 +298,12 @@ class DomainEnd(Endpoint):
     def take(self, link: str, item: WireItem) -> None:
         """Take an item of the wire, from any thread."""
         if isinstance(item, bytes):
-            kind, is_steady = kind_of(item), True
+            kind = kind_of(item)
             if kind in (Kind.SIGN, Kind.MEETING):
                 item, section = split_clocks(item)
-                is_steady = not section or self.clocks.arrive(link, section)
-            if kind is Kind.SIGN and is_steady and self._resting.get(link) == item:
+                if section:
+                    self.clocks.arrive(link, section)
+            if kind is Kind.SIGN and self._resting.get(link) == item:
                 return
             urgent = kind in _URGENT
             received = Received(link, item, len(item), kind is Kind.LIVE, urgent, kind in _FOLLOWS)
@@ -436,13 +437,13 @@ class DomainEnd(Endpoint):
         if source.clock is not None:
             return False
         moving = [sample for sample in entry.samples if not sample.static]
-        self._correct(peer, source, moving, direct=entry.origin == heard.bus)
+        self._correct(peer, source, moving)
         is_live = heard.kind is Kind.LIVE and bool(moving)
         return is_live and self.clocks.jumps(peer.id, entry.origin, entry.clock, source.clock, source.shift)
 
-    def _correct(self, peer: Peer, source: Provenance, moving: Sequence[FromLink], *, direct: bool = False) -> None:
+    def _correct(self, peer: Peer, source: Provenance, moving: Sequence[FromLink]) -> None:
         """Find the clock of a source, and if stamps are to be corrected, move those of its samples, which are new."""
-        source.clock, shift = self.clocks.place(peer.id, source.told, direct=direct)
+        source.clock, shift = self.clocks.place(peer.id, source.told)
         if shift and all(FIRST_STAMP <= sample.stamp + shift < END_OF_STAMPS for sample in moving):
             source.shift = shift
             for sample in moving:

@@ -18,15 +18,15 @@ from tfbus.stamps import from_seconds
 from tfbus.tree.history import samples_of
 
 CHUNK = 2_000
-"""The most samples in one answer, unless a single frame has more."""
-MOST_OF_FRAME = 2_000
+"""The most samples in one answer."""
+MOST_OF_FRAME = CHUNK
 """The most samples of one frame in an answer, the newest."""
 LONGEST_HISTORY = 3_600.0
 """s."""
 MOST_HELD = 1_000
-"""The most live messages of one peer that wait for its past; with one more, the link goes on without the rest of it."""
+"""The most live messages of one peer that wait for its past; with more, the link waits no longer."""
 MOST_HELD_SAMPLES = 100_000
-"""The most samples and removals in the waiting messages of all peers together; beyond it, the same."""
+"""The most samples and removals in the waiting messages of all peers together; with more, the link waits no longer."""
 PATIENCE = 5.0
 """s; the longest wait for one answer."""
 MOST_REMEMBERED = 10_000
@@ -46,14 +46,13 @@ def chunk_of_past(bus: Bus, brought: Iterable[Known], seconds: float, after: str
     after : str
         The chunk begins with the first frame whose name comes after this one.
     """
-    moving = [known for known in brought if known.frame > after and known.sample and not known.sample.static]
     told: list[OutgoingBatch] = []
     count = 0
-    for known in sorted(moving, key=lambda known: known.frame):
+    for known in sorted((known for known in brought if known.frame > after), key=lambda known: known.frame):
         samples = _recent(bus, known.frame, seconds)
         if not samples:
             continue
-        if told and count + len(samples) > CHUNK:
+        if count + len(samples) > CHUNK:
             return told, False
         source = known.source
         told.append(OutgoingBatch(source.origin, source.sequence, samples, source.clock, source.shift))

@@ -91,8 +91,7 @@ class RemoteLookups:
     def close(self) -> None:
         """The link ends."""
         self._is_open = False
-        for peer in list(self._servers):
-            self.left(peer)
+        self._changed.set()
         for pending in self._pending.values():
             pending.done.set()
 
@@ -138,7 +137,7 @@ class RemoteLookups:
         if not self._first < number <= self._number:
             raise MalformedMessageError("lookup", "an answer to a question that was never asked")
         pending = self._pending.get(number)
-        if pending is not None and pending.peer == peer and len(data) > NUMBER:
+        if pending is not None and pending.peer == peer:
             pending.answer = data[NUMBER:]
             pending.done.set()
 
