@@ -19,7 +19,8 @@ links.replica.MANY_ORIGINS links.replica.MOST_REMOVALS links.clocks.MOST_ECHOES 
 links.clocks._MOST_ORIGINS links.replica.MOST_REMEMBERED links.replica.CHUNK
 links.replica.PATIENCE links.domain.MOST_QUESTIONS links.domain.SOONEST_SIGN links.domain.MOST_ROBOTS
 links.channels.MOST_FILTERS links.channels.LONGEST_FILTER links.history.LONGEST_HISTORY links.history.MOST_OF_FRAME
-links.history.MOST_HELD links.history.MOST_HELD_SAMPLES links.history.PATIENCE links.local.local_wire.MOST_CONNECTIONS
+links.history.MOST_HELD links.history.MOST_HELD_SAMPLES links.history.PATIENCE links.history.LONGEST_ASKING
+links.local.local_wire.MOST_CONNECTIONS
 links.local.local_wire.MOST_STRANGERS links.local.local_wire.PATIENCE links.local.connection.LONGEST_HELLO
 links.local.local_wire.MOST_HEARINGS
 links.local.connection.MOST_PUBLISHED links.local.connection.MOST_SENT links.local.local_wire.MOST_UNFINISHED

@@ -29,6 +29,8 @@ MOST_HELD_SAMPLES = 100_000
 """The most samples and removals in the waiting messages of all peers together; with more, the link waits no longer."""
 PATIENCE = 5.0
 """s; the longest wait for one answer."""
+LONGEST_ASKING = 60.0
+"""s; then the link asks a peer for no more of its past."""
 MOST_REMEMBERED = 10_000
 """The most peers that are remembered as asked."""
 
@@ -76,6 +78,7 @@ def _recent(bus: Bus, frame: str, seconds: float) -> list[TransformStamped]:
 
 @dataclass(slots=True)
 class _Open:
+    ends: float
     due: float = 0.0
     after: str = ""
     held: list[Heard] = field(default_factory=list)
@@ -128,14 +131,15 @@ class HistoryAsker:
             return False
         batches = (entry for entry in message.entries if isinstance(entry, ReceivedBatch))
         last = max((sample.child for batch in batches for sample in batch.samples), default="")
-        if last <= waiting.after:
+        if last <= waiting.after or waiting.ends <= self._now():
             return False
         self._ask(peer, last)
         return True
 
     def _ask(self, peer: str, after: str) -> None:
-        waiting = self.open.setdefault(peer, _Open())
-        waiting.after, waiting.due = after, self._now() + PATIENCE
+        now = self._now()
+        waiting = self.open.setdefault(peer, _Open(now + LONGEST_ASKING))
+        waiting.after, waiting.due = after, now + PATIENCE
         self._send(peer, write_body(Kind.PAST_QUESTION, write_question(PastQuestion(self._seconds, after))))
 
     def end(self, peer: str) -> list[Heard]:
