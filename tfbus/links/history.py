@@ -48,9 +48,11 @@ def chunk_of_past(bus: Bus, brought: Iterable[Known], seconds: float, after: str
     after : str
         The chunk begins with the first frame whose name comes after this one.
     """
+    # Most frames may be static, and have no past: each question would sort them and look for one.
+    moving = [known for known in brought if known.frame > after and known.sample and not known.sample.static]
     told: list[OutgoingBatch] = []
     count = 0
-    for known in sorted((known for known in brought if known.frame > after), key=lambda known: known.frame):
+    for known in sorted(moving, key=lambda known: known.frame):
         samples = _recent(bus, known.frame, seconds)
         if not samples:
             continue
