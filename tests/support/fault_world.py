@@ -279,7 +279,7 @@ class OneMachine(World):
         super().check()
         # All names are shown again, and those of the dead are gone. A socket is no name on the loopback.
         until = time.monotonic() + LIMIT
-        while (names := len(list(self._directory.glob("[0-9a-f]*-*"))) - len(self.members)) != 0:
+        while (names := len(list(self._directory.glob("*/[0-9a-f]*"))) - len(self.members)) != 0:
             if self._loopback and names > 0:
                 break
             assert time.monotonic() < until, f"{names} names too many after {self.story[-3:]}"
@@ -290,9 +290,9 @@ class OneMachine(World):
 
     def fault_stale_names(self, member: Member, other: Member) -> None:
         """Leave names behind at which nobody listens, or nobody answers, or which are something else."""
-        (domain, *_) = {path.name.partition("-")[0] for path in self._directory.iterdir()}
+        (folder,) = self._directory.iterdir()
         for kind in ("deaf", "dead", "text", "folder"):
-            path = self._directory / f"{domain}-{self.rng.randrange(16**12):016x}{self.rng.randrange(16**8):08x}"
+            path = folder / f"{self.rng.randrange(16**12):016x}{self.rng.randrange(16**8):08x}"
             if kind in ("deaf", "dead"):
                 listener = socket.socket(socket.AF_UNIX)
                 listener.bind(str(path))

@@ -14,8 +14,8 @@ PATIENCE = 20.0
 
 
 def files_in(directory: str) -> list[Path]:
-    """The files of the links in a directory."""
-    return sorted(Path(directory).iterdir())
+    """The files of the links that meet in a directory, which are in folders of their domains."""
+    return sorted(Path(directory).glob("*/*"))
 
 
 class RawPeer:

@@ -321,7 +321,7 @@ async def test_a_link_makes_and_takes_so_many_connections_and_no_more(
             (path,) = files_in(directory)
             deaf = [stack.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(3)]
             for number, each in enumerate(deaf):
-                each.bind(str(path.with_name(f"{path.name.partition('-')[0]}-{number:024x}")))
+                each.bind(str(path.with_name(f"{number:024x}")))
                 each.listen()
             await until(lambda: bool(ear.warnings))
             assert len(select.select(deaf, [], [], 0.0)[0]) == 2
@@ -408,7 +408,7 @@ async def test_a_process_of_another_user_cannot_talk_even_if_it_may_enter(direct
     wire = LocalWire(DOMAIN, directory=directory)
     async with running(wire) as ear:
         (path,) = files_in(directory)
-        for each in (path, path.parent):
+        for each in (path, path.parent, path.parent.parent):
             each.chmod(0o777)
         with Program(sys.executable, "-P", "-c", OF_ANOTHER_USER, path) as program:
             await anyio.to_thread.run_sync(program.output.expect, "^0$")
@@ -525,8 +525,7 @@ async def test_a_file_at_which_nobody_listens_is_removed(directory: str, loopbac
     async with running(elder):
         (path,) = files_in(directory)
         # A name of before the elder, and one of after both.
-        domain = path.name.partition("-")[0]
-        for name in (f"{domain}-{'0' * 24}", f"{domain}-{'f' * 24}"):
+        for name in ("0" * 24, "f" * 24):
             if loopback:
                 with socket.create_server(("127.0.0.1", 0)) as server:
                     port = server.getsockname()[1]
@@ -534,8 +533,8 @@ async def test_a_file_at_which_nobody_listens_is_removed(directory: str, loopbac
             else:
                 with socket.socket(socket.AF_UNIX) as dead:
                     dead.bind(str(path.with_name(name)))
-        path.with_name(f"{domain}-{'0' * 23}1").write_text("no socket, no port")
-        path.with_name(f"{domain}-{'0' * 23}2").write_text(f"65536 {'00' * 32}")
+        path.with_name("0" * 23 + "1").write_text("no socket, no port")
+        path.with_name("0" * 23 + "2").write_text(f"65536 {'00' * 32}")
         younger = LocalWire(DOMAIN, directory=directory, loopback=loopback)
         async with running(younger) as ear:
             await ear.joined(elder.id)
@@ -563,18 +562,20 @@ async def test_a_directory_that_vanishes_while_a_link_opens_is_made_again_for_it
     directory: str, loopback: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root, bind = Path(directory, "run"), socket.socket.bind
-    vanishes = [True]
+    # Somebody removes all of it, and a link that leaves only the folder of the domain.
+    vanishes = ["folder", "all", "folder"]
 
     def vanish_and_bind(sock: socket.socket, address: Any) -> None:
         if vanishes:
-            root.rmdir()
-            vanishes.clear()
+            (folder,) = root.iterdir()
+            shutil.rmtree(root if vanishes.pop() == "all" else folder)
         bind(sock, address)
 
     monkeypatch.setattr(socket.socket, "bind", vanish_and_bind)
     async with pair(str(root), loopback):
         assert not vanishes
         assert is_private(root)
+    assert files_in(str(root.parent)) == []
 
 
 @pytest.mark.every_loop

@@ -111,7 +111,7 @@ class LocalWire(Wire):
     """
 
     # A connection drops only the oldest waiting messages, so the last one before a silence arrives.
-    rest: float = 6.0
+    rest: float = 12.0
 
     def __init__(
         self, domain: str, robot: str = "", *, directory: str | None = None, loopback: bool | None = None

@@ -1,10 +1,11 @@
 """`MeetingPlace`: how the links of one domain find each other in a directory of the user.
 
-The directory has one file for each link: a Unix socket, or, with `loopback`, a text with the port of the loopback at
-which the link listens and a key. The name of a file is a hash of the domain, the time of the link's opening and a part
-of its id, so any two links agree about which is the younger. A file without a listener belongs to a process that was
-killed, and the first link that finds the file removes it. If that link came between the two steps of a beginning, the
-owner finds its name missing at its next look, and shows it again, as after any other loss of the file.
+The directory has one folder for each domain, named by a hash of it, so that a look costs nothing for other domains. The
+folder has one file for each link: a Unix socket, or, with `loopback`, a text with the port of the loopback at which the
+link listens and a key. The name of a file is the time of the link's opening and a part of its id, so any two links
+agree about which is the younger. A file without a listener belongs to a process that was killed, and the first link
+that finds the file removes it. If that link came between the two steps of a beginning, the owner finds its name missing
+at its next look, and shows it again, as after any other loss of the file. The last link to leave removes the folder.
 
 The directory is the one that was given, or named by ``TFBUS_RUNTIME_DIR``, or else ``tfbus`` in ``XDG_RUNTIME_DIR``, or
 else ``tfbus-UID`` in the directory for temporary files. It belongs to the user and is closed to all others, which is
@@ -30,6 +31,8 @@ BACKLOG: Final = 1024
 LONGEST_PATH: Final = 100
 """Bytes; systems have room for 104 to 108 in the address of a Unix socket."""
 SEND_BUFFER: Final = 2**18
+_TRIES = 5
+_IS_NAME = re.compile("[0-9a-f]{24}").fullmatch
 _OTHERWISE = "or set TFBUS_RUNTIME_DIR to a directory of your own"
 
 
@@ -96,12 +99,11 @@ class MeetingPlace:
     """
 
     def __init__(self, domain: str, link: str, directory: str | None, loopback: bool | None) -> None:
-        self._directory = runtime_directory() if directory is None else Path(directory)
+        self._root = runtime_directory() if directory is None else Path(directory)
         self.loopback: bool = not hasattr(socket, "AF_UNIX") if loopback is None else loopback
         self._family = socket.AF_INET if self.loopback else socket.AF_UNIX
         kind = "loopback" if self.loopback else "unix"
-        self._domain = blake2b(f"{kind} {domain}".encode(), digest_size=6).hexdigest()
-        self._is_name = re.compile(f"{self._domain}-[0-9a-f]{{24}}").fullmatch
+        self._directory = self._root / blake2b(f"{kind} {domain}".encode(), digest_size=6).hexdigest()
         self._link = link
         self.name: str = ""
         self.key: bytes = bytes(KEY)
@@ -116,10 +118,11 @@ class MeetingPlace:
         OSError
             If it is not possible to listen.
         """
-        self.name = self.name or f"{self._domain}-{time.time_ns():016x}{self._link[:8]}"
-        with suppress(FileNotFoundError):
-            return self._listen()
-        # Somebody has removed the directory meanwhile.
+        self.name = self.name or f"{time.time_ns():016x}{self._link[:8]}"
+        for _ in range(_TRIES):
+            # Somebody may remove the directory meanwhile, or the last other link its folder.
+            with suppress(FileNotFoundError):
+                return self._listen()
         return self._listen()
 
     def _listen(self) -> socket.socket:
@@ -127,7 +130,8 @@ class MeetingPlace:
         if not self.loopback and len(os.fsencode(path)) > LONGEST_PATH:
             problem = f"the path of a socket may have {LONGEST_PATH} bytes, and {path} is too long"
             raise OSError(f"{problem}: set TFBUS_RUNTIME_DIR to a shorter path")
-        make_private(self._directory)
+        for directory in (self._root, self._directory):
+            make_private(directory)
         listener = socket.socket(self._family)
         try:
             listener.setblocking(False)
@@ -147,7 +151,7 @@ class MeetingPlace:
         """The names of all links, and of this one unless somebody has removed it; none if the directory has gone."""
         # Every link looks again and again, and a path for each file would take half of its work at rest.
         with suppress(OSError), os.scandir(self._directory) as files:
-            return [file.name for file in files if self._is_name(file.name)]
+            return [file.name for file in files if _IS_NAME(file.name)]
         return []
 
     def dial(self, name: str) -> tuple[socket.socket, bytes]:
@@ -217,7 +221,9 @@ class MeetingPlace:
             (self._directory / name).unlink()
 
     def close(self) -> None:
-        """Remove the link's own file."""
+        """Remove the link's own file, and the folder if it is empty."""
         if self.name:
             self.remove(self.name)
             self.name = ""
+            with suppress(OSError):
+                self._directory.rmdir()
