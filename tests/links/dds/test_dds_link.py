@@ -3,6 +3,7 @@ import os
 import re
 import struct
 import sys
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
@@ -182,6 +183,30 @@ async def test_what_waits_for_the_name_of_its_node_comes_before_the_end_of_its_p
             assert end.heard == [static("map", "lidar", authority=node.id)]
             assert end.bus.statistics().frames == 0
             end.heard.clear()
+
+
+@pytest.mark.parametrize("late", ["take", "take_status"])
+async def test_a_message_that_is_read_after_the_end_of_its_writer_is_still_of_its_node(
+    late: str, domain_number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called = getattr(DataReader, late)
+    waits = Event()
+
+    def call_late(reader: Any, *arguments: Any, **options: Any) -> Any:
+        while waits.is_set() and reader.topic.name == "rt/tf_static" and reader.get_matched_publications():
+            time.sleep(0.01)
+        return called(reader, *arguments, **options)
+
+    monkeypatch.setattr(DataReader, late, call_late)
+    async with joined(domain_number, drop_lost=True) as end:
+        with DdsNode(domain_number) as node:
+            node.writer("rt/tf_static")
+            await until(lambda: end.link.peers == (node.id,))
+            waits.set()
+            node.say(static("map", "lidar"), topic="rt/tf_static")
+        await until(lambda: not end.link.peers)
+        assert end.heard == [static("map", "lidar", authority=node.id)]
+        assert end.bus.statistics().frames == 0
 
 
 async def test_joints_the_time_and_a_description_come_from_topics_of_their_own(domain_number: int) -> None:

@@ -151,18 +151,18 @@ def test_new_writers_of_other_vendors_greet_a_second_reader_that_stays_a_while()
 
     greeting = Greeting(make, lambda: now)
     cyclone, fast, late = "0110" + "a" * 28, "010f" + "b" * 28, "010f" + "c" * 28
-    assert greeting.update(frozenset({cyclone})) is None
-    assert greeting.update(frozenset({cyclone, fast})) == GREETING_TIME
+    assert greeting.update({cyclone}) is None
+    assert greeting.update({cyclone, fast}) == GREETING_TIME
     now = 0.1
     # It may have come too late for the reader that is there.
-    assert greeting.update(frozenset({cyclone, fast, late})) == pytest.approx(GREETING_TIME - 0.1)
+    assert greeting.update({cyclone, fast, late}) == pytest.approx(GREETING_TIME - 0.1)
     assert made == [["made"]]
     now = GREETING_TIME
-    assert greeting.update(frozenset({cyclone, fast, late})) == GREETING_TIME
+    assert greeting.update({cyclone, fast, late}) == GREETING_TIME
     assert made == [["made", "deleted"], ["made"]]
     now = 2 * GREETING_TIME
-    assert greeting.update(frozenset({cyclone, late})) is None
-    greeting.update(frozenset({fast}))
+    assert greeting.update({cyclone, late}) is None
+    greeting.update({fast})
     greeting.close()
     greeting.close()
     assert made == [["made", "deleted"]] * 3

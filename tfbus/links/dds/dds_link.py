@@ -14,6 +14,7 @@ A participant is a peer as long as one of its writers is matched, on any topic o
 import os
 import re
 import struct
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
@@ -42,6 +43,7 @@ from tfbus.links.dds.readers import (
     Greeting,
     Publishers,
     ReaderThread,
+    Take,
     delete,
     is_of_ros,
     join,
@@ -163,6 +165,7 @@ _KEPT = 100
 """So many of its own messages a writer repeats when they were lost, as tf2's broadcasters do."""
 _NODES = "ros_discovery_info"
 _OTHERS = "other topics"
+_UNKNOWN = "", ""
 """The authority of joint positions and of the time."""
 _TYPES: dict[Other, Any] = {
     "joints": RawJointState,
@@ -217,11 +220,11 @@ class DdsCarrier(RosCarrier):
         self._open = ExitStack()
         self._publishers = Publishers(self)
         self._participants: BuiltinDataReader | None = None
-        self._writers: dict[int, tuple[str, str]] = {}
-        self._matched: dict[int, frozenset[str]] = {}
+        # The ids of the writers that each reader is matched with and of their participants, by the library's numbers.
+        self._writers: defaultdict[int, dict[int, tuple[str, str]]] = defaultdict(dict)
         self._greetings: dict[int, Greeting] = {}
         self._behind: dict[DataReader[Any], int] = {}
-        self._present: frozenset[str] = frozenset()
+        self._present: set[str] = set()
         self._subscriptions: list[DataReader[Any]] = []
         self._moving_writer: DataWriter[RawTFMessage]
         self._static_writer: DataWriter[RawTFMessage]
@@ -260,7 +263,8 @@ class DdsCarrier(RosCarrier):
                 if not static:
                     self._greetings[number] = Greeting(partial(DataReader, participant, topics[name], _SECOND))
                     self._open.callback(self._greetings[number].close)
-                thread.watch(reader, partial(self._take, static), partial(self._match, number))
+                take = partial(self._take, static, number)
+                thread.watch(reader, take, partial(self._match, number, take))
             self._introduce(participant)
             thread.start()
             self._open.callback(thread.stop)
@@ -316,12 +320,12 @@ class DdsCarrier(RosCarrier):
 
     # The thread of the readers calls the methods below.
 
-    def _take(self, static: bool, reader: DataReader[RawTFMessage]) -> bool:
-        return self._take_each(reader, partial(self._take_transforms, static, reader))
+    def _take(self, static: bool, number: int, reader: DataReader[RawTFMessage]) -> bool:
+        return self._take_each(reader, partial(self._take_transforms, static, number, reader))
 
-    def _take_transforms(self, static: bool, reader: DataReader[RawTFMessage], message: Any) -> None:
+    def _take_transforms(self, static: bool, number: int, reader: DataReader[RawTFMessage], message: Any) -> None:
         handle = message.sample_info.publication_handle
-        publisher, participant = self._writers.get(handle) or self._find(reader, handle)
+        publisher, participant = self._writers[number].get(handle) or self._find(reader, handle)
         if self.settings.authority is None:
             self._publishers.message(publisher, participant, message.payload, static)
         else:
@@ -359,20 +363,14 @@ class DdsCarrier(RosCarrier):
         self._behind[reader] = behind
 
     def _find(self, reader: DataReader[RawTFMessage], handle: int) -> tuple[str, str]:
-        publication = self._publication(reader, handle)
-        if publication is None:
-            return "", ""
-        self._writers[handle] = found = publication.key.hex, publication.participant_key.hex
-        return found
-
-    def _publication(self, reader: DataReader[RawTFMessage], handle: int) -> Any:
-        """The data that the library has of a writer; None if it has gone since, or the library cannot read it."""
+        """The ids of a writer and its participant; empty if it has gone since, or the library cannot read its data."""
         try:
-            return publication(reader, handle)
+            found = publication(reader, handle)
         except UnicodeDecodeError as error:
             # A stranger has given the writer such a name.
             self._failed(error)
-            return None
+            found = None
+        return _UNKNOWN if found is None else (found.key.hex, found.participant_key.hex)
 
     def is_of_ros(self, participant: str) -> bool:
         """Whether a participant has the user data that ROS 2 gives it."""
@@ -407,25 +405,27 @@ class DdsCarrier(RosCarrier):
     def _pass_other(self, other: Other, topic: str, message: Any) -> None:
         self._pass_on(_OTHERS, RosMessage(message.payload, False, topic, other))
 
-    def _match(self, number: int, reader: DataReader[RawTFMessage]) -> float | None:
+    def _match(self, number: int, take: Take, reader: DataReader[RawTFMessage]) -> float | None:
         try:
             handles = reader.get_matched_publications()
         except IndexError:
             # Another writer has come between the two calls that the library makes for this.
             return RETRY
-        self._writers.clear()
-        found = (self._publication(reader, handle) for handle in handles)
-        publications = [each for each in found if each is not None]
-        self._matched[number] = frozenset(each.participant_key.hex for each in publications)
-        present = frozenset().union(*self._matched.values())
-        self._publishers.keep_only(set(present))
+        # The library's numbers have a sign here, and none in messages.
+        found = {handle % 2**64: self._find(reader, handle) for handle in handles}
+        if self._writers[number].items() - found.items():
+            # The messages of writers that have gone, because the library knows these no more.
+            take(reader)
+        self._writers[number] = {handle: ids for handle, ids in found.items() if ids != _UNKNOWN}
+        present = {participant for known in self._writers.values() for _, participant in known.values()}
+        self._publishers.keep_only(present)
         for participant in sorted(present - self._present):
             self._receive(Received(participant, Joined()))
         for participant in sorted(self._present - present):
             self._receive(Received(participant, Left()))
         self._present = present
         greeting = self._greetings.get(number)
-        return None if greeting is None else greeting.update(frozenset(each.key.hex for each in publications))
+        return None if greeting is None else greeting.update({writer for writer, _ in self._writers[number].values()})
 
     def _failed(self, error: Exception) -> None:
         """Count and tell an error that has kept messages from being read."""

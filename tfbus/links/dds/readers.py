@@ -133,12 +133,12 @@ class Greeting:
     def __init__(self, make: Callable[[], DataReader[Any]], now: Callable[[], float] = monotonic) -> None:
         self._make = make
         self._now = now
-        self._met: frozenset[str] = frozenset()
+        self._met: set[str] = set()
         self._wanted = False
         self._second: DataReader[Any] | None = None
         self._until = 0.0
 
-    def update(self, writers: frozenset[str]) -> float | None:
+    def update(self, writers: set[str]) -> float | None:
         """Take the ids of all writers that there are; returns after how many seconds to call this again, if at all."""
         self._wanted |= any(not writer.startswith(_CYCLONE) for writer in writers - self._met)
         self._met = writers
