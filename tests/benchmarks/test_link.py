@@ -30,7 +30,9 @@ pytest_plugins = ["side_by_side"]
 
 BACKENDS = pytest.mark.parametrize("backend", ["asyncio", "asyncio+uvloop", "trio"])
 SECONDS = 2.0
-SETTLE, RESTED = 5.0, 10.0
+# Until links sign as rarely as they ever do, and then for two signs of each.
+SETTLE, RESTED = 16.0, 24.0
+OBSERVED = 10.0
 MESSAGES = 300
 ASKED = 1_000
 STEPS = 5
@@ -406,7 +408,7 @@ def test_one_robot_of_many(table: Table) -> None:
                     await until(lambda: bus.statistics().frames >= 10 * len(heard))
                     await anyio.sleep(2.0)
                     before = link.statistics().received_samples, time.process_time(), float(router("", True))
-                    await anyio.sleep(RESTED)
+                    await anyio.sleep(OBSERVED)
                     after = link.statistics().received_samples, time.process_time(), float(router("", True))
                     return after[0] - before[0], after[1] - before[1], after[2] - before[2]
 
