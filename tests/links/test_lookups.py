@@ -224,12 +224,14 @@ async def test_a_server_that_goes_ends_the_lookups_that_wait_there(end: str) -> 
     network = MemoryNetwork()
     with Bus() as bus, Buffer(bus) as buffer, Bus() as other:
         async with DomainLink(other, "tf", network.wire()) as asker, anyio.create_task_group() as tasks:
-            link = DomainLink(bus, "tf", network.wire())
-            async with link, BufferServer(buffer, link) as server:
-                waiting = Asked(tasks, lambda: asker.lookup("map", "base"))
-                await until(lambda: server.statistics().waiting == 1)
-                if end == "kill":
-                    network.kill(link.id)
+            async with DomainLink(bus, "tf", network.wire()) as link:
+                async with BufferServer(buffer, link) as server:
+                    waiting = Asked(tasks, lambda: asker.lookup("map", "base"))
+                    await until(lambda: server.statistics().waiting == 1)
+                    if end == "kill":
+                        network.kill(link.id)
+                        await until(lambda: waiting.ended)
+                if end == "server":
                     await until(lambda: waiting.ended)
             await until(lambda: waiting.ended)
             assert isinstance(waiting.error, RemoteLookupError)
