@@ -409,6 +409,27 @@ async def test_what_is_dropped_is_asked_again_and_a_silent_server_is_given_up(lo
             scene.network.lose = lose(0)
 
 
+@pytest.mark.every_loop
+@in_simulated_time
+async def test_a_server_that_answers_again_may_be_silent_again() -> None:
+    async with asked() as scene, anyio.create_task_group() as tasks:
+        answers: list[bytes] = []
+
+        def lose(_sender: str, _link: str, message: bytes) -> bool:
+            if kind_of(message) is Kind.LOOKUP_ANSWER:
+                answers.append(message)
+            return kind_of(message) is Kind.LOOKUP_ANSWER and len(answers) % 2 == 0
+
+        scene.network.lose = lose
+        waiting = Asked(tasks, lambda: scene.lookup("map", "base"))
+        # More often in all than a server may be silent in a row.
+        await anyio.sleep(120.0)
+        assert len(answers) > 8
+        scene.bus.publish(static("map", "base"))
+        await until(lambda: waiting.ended)
+        assert waiting.answer.static
+
+
 # Strangers
 
 

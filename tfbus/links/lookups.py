@@ -166,6 +166,7 @@ class RemoteLookups:
                 if error.reason != "silent" or silences > _MOST_SILENCES or anyio.current_time() >= until:
                     raise
             except LookupTimeoutError as error:
+                silences = 0
                 if left <= LONGEST_WAIT:
                     missing = error.__cause__ if isinstance(error.__cause__, TransformLookupError) else error
                     target, source = question.target, question.source
