@@ -620,6 +620,27 @@ async def test_a_link_without_free_files_goes_on_and_meets_others_when_there_are
                 await ear.joined(peer.link)
 
 
+async def test_a_link_at_the_loopback_whose_folder_is_closed_for_a_moment_is_met_afterwards(
+    directory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[str] = []
+    scandir = os.scandir
+
+    def refuse_once(path: str) -> Any:
+        looks.append(path)
+        if len(looks) == 2:
+            raise PermissionError("closed for a moment")
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refuse_once)
+    wire = LocalWire(DOMAIN, directory=directory, loopback=True)
+    async with running(wire) as ear:
+        await until(lambda: len(looks) >= 3)
+        assert len(ear.warnings) == 1
+        async with running(LocalWire(DOMAIN, directory=directory, loopback=True)) as other:
+            await met(ear, other)
+
+
 # Opening and closing
 
 

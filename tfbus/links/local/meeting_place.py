@@ -139,9 +139,10 @@ class MeetingPlace:
             listener.listen(BACKLOG)
             if self.loopback:
                 # Another program may have the port of before, and know the key that was said there.
-                self.key = secrets.token_bytes(KEY)
+                key = secrets.token_bytes(KEY)
                 with os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w") as file:
-                    file.write(f"{listener.getsockname()[1]} {self.key.hex()}")
+                    file.write(f"{listener.getsockname()[1]} {key.hex()}")
+                self.key = key
         except OSError:
             listener.close()
             raise
