@@ -1,5 +1,6 @@
 """Links of one machine at the seam below them, over real sockets."""
 
+import errno
 import gc
 import os
 import resource
@@ -168,6 +169,27 @@ async def test_no_frame_tears_where_the_socket_has_little_room(directory: str, l
         assert [message for message in heard if message[:1] == b"s"] == sent
         rest = [message for message in heard if message[:1] == b"p"]
         assert [message for message in published if message in set(rest)] == rest
+
+
+async def test_a_connection_whose_frame_cannot_be_finished_ends_and_another_begins(
+    directory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send, large = socket.socket.send, bytes(3_000)
+
+    def run_out_of_memory(sock: socket.socket, data: bytes, flags: int = 0) -> int:
+        if len(data) == len(framed(large)):
+            return send(sock, data[:100], flags)
+        if len(data) == len(framed(large)) - 100:
+            raise OSError(errno.ENOBUFS, "no buffer space available")
+        return send(sock, data, flags)
+
+    async with pair(directory) as (one, ear_one, two, ear_two):
+        monkeypatch.setattr(socket.socket, "send", run_out_of_memory)
+        assert one.send(two.id, large)
+        await until(lambda: (two.id, Left()) in ear_one.items and (one.id, Left()) in ear_two.items)
+        await met(ear_one, ear_two)
+        assert one.send(two.id, b"again")
+        await until(lambda: ear_two.said(one.id) == [b"again"])
 
 
 async def test_the_oldest_published_messages_are_dropped_for_a_link_that_does_not_read_and_sent_ones_go_first(

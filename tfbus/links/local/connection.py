@@ -7,6 +7,7 @@ import socket
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from selectors import EVENT_READ, EVENT_WRITE
 from time import monotonic
 from typing import Any, Final
@@ -194,7 +195,10 @@ class Connection:
             except BlockingIOError:
                 break
             except OSError:
-                # The other side reads no more. The reading finds the end, after all that the other has written before.
+                # The other side reads no more, or this machine has no memory, and the frame may have begun. The reading
+                # finds the end, after all that the other has written before.
+                with suppress(OSError):
+                    self.sock.shutdown(socket.SHUT_WR)
                 written = len(frame)
             self._begun = memoryview(frame)[written:] if written < len(frame) else b""
             most -= written
