@@ -600,6 +600,24 @@ async def test_a_directory_that_vanishes_while_a_link_opens_is_made_again_for_it
     assert files_in(str(root.parent)) == []
 
 
+async def test_a_directory_that_vanishes_before_its_folder_is_made_is_private_again(
+    directory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, mkdir = Path(directory, "run"), os.mkdir
+
+    def vanish_and_make(path: Path, *options: Any) -> None:
+        if Path(path).parent == root and not is_remade:
+            is_remade.append(True)
+            shutil.rmtree(root)
+        mkdir(path, *options)
+
+    is_remade: list[bool] = []
+    monkeypatch.setattr(os, "mkdir", vanish_and_make)
+    async with pair(str(root)):
+        assert is_remade
+        assert is_private(root)
+
+
 @pytest.mark.every_loop
 async def test_links_work_where_the_system_has_no_poll_object_that_is_a_file(
     directory: str, loopback: bool, monkeypatch: pytest.MonkeyPatch

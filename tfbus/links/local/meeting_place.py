@@ -46,18 +46,18 @@ def runtime_directory() -> Path:
     return Path(tempfile.gettempdir(), name)
 
 
-def make_private(directory: Path) -> None:
-    """Make a directory that only its user can enter.
+def make_private(directory: Path, *, parents: bool = False) -> None:
+    """Make a directory that only its user can enter, and perhaps its parents, as the system makes any.
 
     Raises
     ------
     PermissionError
         If it is another user's, or others can enter it, or it cannot be made.
     FileNotFoundError
-        If it has vanished again.
+        If it, or its parent, has vanished again.
     """
     try:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        directory.mkdir(mode=0o700, parents=parents, exist_ok=True)
         found = directory.lstat()
     except (PermissionError, FileExistsError, NotADirectoryError) as error:
         problem = f"cannot be made a directory ({error.strerror}): make it one with mode 700"
@@ -130,8 +130,8 @@ class MeetingPlace:
         if not self.loopback and len(os.fsencode(path)) > LONGEST_PATH:
             problem = f"the path of a socket may have {LONGEST_PATH} bytes, and {path} is too long"
             raise OSError(f"{problem}: set TFBUS_RUNTIME_DIR to a shorter path")
-        for directory in (self._root, self._directory):
-            make_private(directory)
+        make_private(self._root, parents=True)
+        make_private(self._directory)
         listener = socket.socket(self._family)
         try:
             listener.setblocking(False)
