@@ -722,6 +722,19 @@ async def test_a_file_or_a_symbolic_link_in_place_of_the_directory_is_refused(di
                 pass
 
 
+async def test_a_relative_directory_stays_where_it_was(directory: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    elsewhere = Path(directory, "elsewhere")
+    elsewhere.mkdir()
+    monkeypatch.chdir(directory)
+    async with running(LocalWire(DOMAIN, directory="run")) as ear:
+        monkeypatch.chdir(elsewhere)
+        for _ in range(2):
+            async with running(LocalWire(DOMAIN, directory=str(Path(directory, "run")))) as other:
+                await met(ear, other)
+            await anyio.sleep(0.2)
+        assert list(elsewhere.iterdir()) == []
+
+
 async def test_a_path_that_is_too_long_for_a_socket_is_told(directory: str) -> None:
     # The last one is too long for the name of a directory, too.
     for length in (20, 100):

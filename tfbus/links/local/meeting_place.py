@@ -99,7 +99,8 @@ class MeetingPlace:
     """
 
     def __init__(self, domain: str, link: str, directory: str | None, loopback: bool | None) -> None:
-        self._root = runtime_directory() if directory is None else Path(directory)
+        # A program may go to another directory while its links look for others.
+        self._root = (runtime_directory() if directory is None else Path(directory)).absolute()
         self.loopback: bool = not hasattr(socket, "AF_UNIX") if loopback is None else loopback
         self._family = socket.AF_INET if self.loopback else socket.AF_UNIX
         kind = "loopback" if self.loopback else "unix"
