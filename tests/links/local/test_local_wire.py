@@ -28,7 +28,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.local_links import RawPeer, files_in, framed
 from support.processes import OPEN_FILES, Program, on_one_loop, until
-from support.wires import HEARS_ALL, Ear, met, running
+from support.wires import HEARS_ALL, LIVE, Ear, met, running
 
 from tfbus.links.local import local_wire
 from tfbus.links.local.connection import LONGEST_HELLO
@@ -762,13 +762,16 @@ async def test_the_environment_names_the_directory(
 
 
 @pytest.mark.every_loop
-async def test_all_that_waits_goes_out_when_a_link_closes(directory: str) -> None:
+@pytest.mark.parametrize("loopback", [False, True])
+async def test_all_that_waits_goes_out_when_a_link_closes(directory: str, loopback: bool) -> None:
     messages = [bytes(1_000_000) + str(number).encode() for number in range(5)]
-    async with running(LocalWire(DOMAIN, directory=directory)) as stays:
-        async with running(LocalWire(DOMAIN, directory=directory)) as ends:
+    async with running(LocalWire(DOMAIN, directory=directory, loopback=loopback)) as stays:
+        async with running(LocalWire(DOMAIN, directory=directory, loopback=loopback)) as ends:
             await met(stays, ends)
             for message in messages:
                 assert ends.wire.send(stays.id, message)
+            # This one comes too late to be read.
+            stays.wire.publish(LIVE, b"goodbye")
         await stays.left(ends.id)
         assert stays.said(ends.id) == messages
 

@@ -208,10 +208,17 @@ class Connection:
             self._watch()
 
     async def drain(self) -> None:
-        """Wait until all that waits has been written, instead of the poll."""
+        """Wait until all that waits has been written, instead of the poll; on the loopback, until it has been read."""
         while self.waits:
             await anyio.wait_writable(self.sock)
             self.flush()
+        if self.sock.family == socket.AF_INET:
+            # To close a port with unread bytes would reset it, and lose what the other side has not read.
+            with suppress(OSError):
+                self.sock.shutdown(socket.SHUT_WR)
+                await anyio.wait_readable(self.sock)
+                while self.sock.recv(READ_AT_ONCE):
+                    await anyio.wait_readable(self.sock)
 
     # Reading
 
