@@ -722,17 +722,17 @@ async def test_a_file_or_a_symbolic_link_in_place_of_the_directory_is_refused(di
                 pass
 
 
-async def test_a_relative_directory_stays_where_it_was(directory: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    elsewhere = Path(directory, "elsewhere")
-    elsewhere.mkdir()
+async def test_a_relative_directory_stays_where_it_was(
+    directory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(directory)
     async with running(LocalWire(DOMAIN, directory="run")) as ear:
-        monkeypatch.chdir(elsewhere)
+        monkeypatch.chdir(tmp_path)
         for _ in range(2):
             async with running(LocalWire(DOMAIN, directory=str(Path(directory, "run")))) as other:
                 await met(ear, other)
             await anyio.sleep(0.2)
-        assert list(elsewhere.iterdir()) == []
+        assert files_in(str(tmp_path)) == []
 
 
 async def test_a_path_that_is_too_long_for_a_socket_is_told(directory: str) -> None:
