@@ -638,6 +638,32 @@ async def test_links_work_where_the_system_has_no_poll_object_that_is_a_file(
         await ear.left(three.id)
 
 
+async def test_a_socket_that_is_closed_while_a_thread_waits_for_it_ends_no_link(
+    directory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Windows(selectors.SelectSelector):
+        """Fails as there, where a wait ends with an error if one of its sockets is closed."""
+
+        def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+            before = set(self.get_map())
+            ready = super().select(timeout)
+            if threading.current_thread() is not threading.main_thread() and before - set(self.get_map() or before):
+                failed.append(True)
+                raise OSError(errno.EBADF, "not a socket")
+            return ready
+
+    failed: list[bool] = []
+    monkeypatch.setattr(selectors, "DefaultSelector", Windows)
+    monkeypatch.setattr(local_wire, "PATIENCE", 0.1)
+    async with pair(directory, loopback=True) as (one, _, two, ear_two):
+        strangers = [await RawPeer.connect(path) for path in files_in(directory) for _ in range(5)]
+        await until(lambda: bool(failed))
+        for stranger in strangers:
+            await stranger.stream.aclose()
+        assert one.send(two.id, b"still here")
+        await until(lambda: ear_two.said(one.id) == [b"still here"])
+
+
 @pytest.mark.every_loop
 async def test_a_link_without_free_files_goes_on_and_meets_others_when_there_are_some(directory: str) -> None:
     async with pair(directory) as (one, ear, two, _):

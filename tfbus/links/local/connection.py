@@ -71,7 +71,9 @@ class Poll:
         if not hasattr(self._selector, "fileno"):
             thread = anyio.CapacityLimiter(1)
             while True:
-                await anyio.to_thread.run_sync(self.ready, _LOOK_AGAIN, abandon_on_cancel=True, limiter=thread)
+                # A socket that is closed meanwhile may end the wait with an error.
+                with suppress(OSError):
+                    await anyio.to_thread.run_sync(self.ready, _LOOK_AGAIN, abandon_on_cancel=True, limiter=thread)
                 serve()
         file: int = self._selector.fileno()
         loop: Any = anyio.lowlevel.current_token().native_token
