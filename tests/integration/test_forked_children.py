@@ -149,6 +149,25 @@ anyio.run(main)
     ]
 
 
+def test_a_link_that_was_made_before_the_fork_is_entered_by_the_parent_alone() -> None:
+    # The copies would have one id, and the copies of the bus one origin: they would not hear each other.
+    lines = said("""
+async def enter(link):
+    async with link:
+        pass
+
+bus = Bus(max_behind=None)
+link = LocalLink(bus, directory=tempfile.mkdtemp())
+in_a_child(lambda: tell(anyio.run, enter, link))
+in_a_child(lambda: tell(anyio.run, enter, LocalLink(bus, directory=tempfile.mkdtemp())))
+tell(anyio.run, enter, link)
+""")
+    assert [line.partition(":")[0] for line in lines] == [
+        *["RuntimeError this process was forked since a link of the bus was made"] * 2,
+        "did None",
+    ]
+
+
 @pytest.mark.thorough
 def test_a_child_of_a_program_with_a_local_link_meets_it_and_the_parent_has_it_still() -> None:
     lines = said("""

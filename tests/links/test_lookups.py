@@ -224,12 +224,14 @@ async def test_a_server_that_goes_ends_the_lookups_that_wait_there(end: str) -> 
     network = MemoryNetwork()
     with Bus() as bus, Buffer(bus) as buffer, Bus() as other:
         async with DomainLink(other, "tf", network.wire()) as asker, anyio.create_task_group() as tasks:
-            link = DomainLink(bus, "tf", network.wire())
-            async with link, BufferServer(buffer, link) as server:
-                waiting = Asked(tasks, lambda: asker.lookup("map", "base"))
-                await until(lambda: server.statistics().waiting == 1)
-                if end == "kill":
-                    network.kill(link.id)
+            async with DomainLink(bus, "tf", network.wire()) as link:
+                async with BufferServer(buffer, link) as server:
+                    waiting = Asked(tasks, lambda: asker.lookup("map", "base"))
+                    await until(lambda: server.statistics().waiting == 1)
+                    if end == "kill":
+                        network.kill(link.id)
+                        await until(lambda: waiting.ended)
+                if end == "server":
                     await until(lambda: waiting.ended)
             await until(lambda: waiting.ended)
             assert isinstance(waiting.error, RemoteLookupError)
@@ -405,6 +407,27 @@ async def test_what_is_dropped_is_asked_again_and_a_silent_server_is_given_up(lo
             waited = given_up if lost is Kind.LOOKUP_ANSWER else 0.0
             assert anyio.current_time() - began == pytest.approx(waited)
             scene.network.lose = lose(0)
+
+
+@pytest.mark.every_loop
+@in_simulated_time
+async def test_a_server_that_answers_again_may_be_silent_again() -> None:
+    async with asked() as scene, anyio.create_task_group() as tasks:
+        answers: list[bytes] = []
+
+        def lose(_sender: str, _link: str, message: bytes) -> bool:
+            if kind_of(message) is Kind.LOOKUP_ANSWER:
+                answers.append(message)
+            return kind_of(message) is Kind.LOOKUP_ANSWER and len(answers) % 2 == 0
+
+        scene.network.lose = lose
+        waiting = Asked(tasks, lambda: scene.lookup("map", "base"))
+        # More often in all than a server may be silent in a row.
+        await anyio.sleep(120.0)
+        assert len(answers) > 8
+        scene.bus.publish(static("map", "base"))
+        await until(lambda: waiting.ended)
+        assert waiting.answer.static
 
 
 # Strangers

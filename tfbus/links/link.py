@@ -207,7 +207,7 @@ class Link(AsyncOnly):
         On entering, if there is no connection.
     BusClosedError, RuntimeError
         On entering, if the bus is closed; if it belongs to another thread, another link of it was entered in another
-        event loop, or the link was entered before.
+        event loop, the link was entered before, or this process was forked since a link of the bus was made.
 
     Examples
     --------
@@ -482,7 +482,7 @@ class DomainLink(Link):
         On entering, if there is no network.
     BusClosedError, RuntimeError
         On entering, if the bus is closed; if it belongs to another thread, another link of it was entered in another
-        event loop, or the link was entered before.
+        event loop, the link was entered before, or this process was forked since a link of the bus was made.
 
     Notes
     -----

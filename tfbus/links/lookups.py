@@ -96,12 +96,15 @@ class RemoteLookups:
             pending.done.set()
 
     def note_server(self, peer: str, robot: str, serves: bool) -> None:
-        """Note whether a peer serves a buffer."""
+        """Note whether a peer serves a buffer; what waits for the answer of one that no longer does has none."""
         if serves != (peer in self._servers):
             if serves:
                 self._servers[peer] = robot
             else:
                 del self._servers[peer]
+                for pending in self._pending.values():
+                    if pending.peer == peer:
+                        pending.done.set()
             # An anyio event stays set, so later waiters need a new one.
             self._changed.set()
             self._changed = anyio.Event()
@@ -109,9 +112,6 @@ class RemoteLookups:
     def left(self, peer: str) -> None:
         """Note that a link has gone."""
         self.note_server(peer, "", serves=False)
-        for pending in self._pending.values():
-            if pending.peer == peer:
-                pending.done.set()
         if self.server is not None:
             self.server.lose(peer)
 
@@ -166,6 +166,7 @@ class RemoteLookups:
                 if error.reason != "silent" or silences > _MOST_SILENCES or anyio.current_time() >= until:
                     raise
             except LookupTimeoutError as error:
+                silences = 0
                 if left <= LONGEST_WAIT:
                     missing = error.__cause__ if isinstance(error.__cause__, TransformLookupError) else error
                     target, source = question.target, question.source

@@ -24,6 +24,7 @@ The relay also counts the ways to each bus, its *reach*: a link with `drop_lost`
 not reached any more. They are not removed: see `tfbus.links.replica`.
 """
 
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -182,6 +183,7 @@ class Relay:
         self._removing: tuple[str, Provenance | None] | None = None
         self._reached: set[bytes] = set()
         self._remembers = False
+        self._process = os.getpid()
 
     def attach(self, outbox: Outbox) -> None:
         """Give a link the latched samples, the entries of the other links, and all samples from now on.
@@ -189,7 +191,14 @@ class Relay:
         Raises
         ------
         BusClosedError
+        RuntimeError
+            In a child made by `fork`: its copy and that of the parent have one origin, and each would take what the
+            other says for its own.
         """
+        if self._process != os.getpid():
+            raise RuntimeError(
+                "this process was forked since a link of the bus was made: make the bus and its links in the child"
+            )
         # A bus with two links may hear a sample that has gone through a world without origins by either.
         self._remembers = self._remembers or outbox.own is None or bool(self._outboxes)
         if self._registration is None:

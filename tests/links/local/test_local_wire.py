@@ -1,5 +1,6 @@
 """Links of one machine at the seam below them, over real sockets."""
 
+import errno
 import gc
 import os
 import resource
@@ -27,7 +28,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.local_links import RawPeer, files_in, framed
 from support.processes import OPEN_FILES, Program, on_one_loop, until
-from support.wires import HEARS_ALL, Ear, met, running
+from support.wires import HEARS_ALL, LIVE, Ear, met, running
 
 from tfbus.links.local import local_wire
 from tfbus.links.local.connection import LONGEST_HELLO
@@ -168,6 +169,27 @@ async def test_no_frame_tears_where_the_socket_has_little_room(directory: str, l
         assert [message for message in heard if message[:1] == b"s"] == sent
         rest = [message for message in heard if message[:1] == b"p"]
         assert [message for message in published if message in set(rest)] == rest
+
+
+async def test_a_connection_whose_frame_cannot_be_finished_ends_and_another_begins(
+    directory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send, large = socket.socket.send, bytes(3_000)
+
+    def run_out_of_memory(sock: socket.socket, data: bytes, flags: int = 0) -> int:
+        if len(data) == len(framed(large)):
+            return send(sock, data[:100], flags)
+        if len(data) == len(framed(large)) - 100:
+            raise OSError(errno.ENOBUFS, "no buffer space available")
+        return send(sock, data, flags)
+
+    async with pair(directory) as (one, ear_one, two, ear_two):
+        monkeypatch.setattr(socket.socket, "send", run_out_of_memory)
+        assert one.send(two.id, large)
+        await until(lambda: (two.id, Left()) in ear_one.items and (one.id, Left()) in ear_two.items)
+        await met(ear_one, ear_two)
+        assert one.send(two.id, b"again")
+        await until(lambda: ear_two.said(one.id) == [b"again"])
 
 
 async def test_the_oldest_published_messages_are_dropped_for_a_link_that_does_not_read_and_sent_ones_go_first(
@@ -578,6 +600,24 @@ async def test_a_directory_that_vanishes_while_a_link_opens_is_made_again_for_it
     assert files_in(str(root.parent)) == []
 
 
+async def test_a_directory_that_vanishes_before_its_folder_is_made_is_private_again(
+    directory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, mkdir = Path(directory, "run"), os.mkdir
+
+    def vanish_and_make(path: Path, *options: Any) -> None:
+        if Path(path).parent == root and not is_remade:
+            is_remade.append(True)
+            shutil.rmtree(root)
+        mkdir(path, *options)
+
+    is_remade: list[bool] = []
+    monkeypatch.setattr(os, "mkdir", vanish_and_make)
+    async with pair(str(root)):
+        assert is_remade
+        assert is_private(root)
+
+
 @pytest.mark.every_loop
 async def test_links_work_where_the_system_has_no_poll_object_that_is_a_file(
     directory: str, loopback: bool, monkeypatch: pytest.MonkeyPatch
@@ -596,6 +636,32 @@ async def test_links_work_where_the_system_has_no_poll_object_that_is_a_file(
             await until(lambda: (ear.said(two.id), ear.said(three.id)) == ([large], [b"to all"]))
         await ear.left(two.id)
         await ear.left(three.id)
+
+
+async def test_a_socket_that_is_closed_while_a_thread_waits_for_it_ends_no_link(
+    directory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Windows(selectors.SelectSelector):
+        """Fails as there, where a wait ends with an error if one of its sockets is closed."""
+
+        def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+            before = set(self.get_map())
+            ready = super().select(timeout)
+            if threading.current_thread() is not threading.main_thread() and before - set(self.get_map() or before):
+                failed.append(True)
+                raise OSError(errno.EBADF, "not a socket")
+            return ready
+
+    failed: list[bool] = []
+    monkeypatch.setattr(selectors, "DefaultSelector", Windows)
+    monkeypatch.setattr(local_wire, "PATIENCE", 0.1)
+    async with pair(directory, loopback=True) as (one, _, two, ear_two):
+        strangers = [await RawPeer.connect(path) for path in files_in(directory) for _ in range(5)]
+        await until(lambda: bool(failed))
+        for stranger in strangers:
+            await stranger.stream.aclose()
+        assert one.send(two.id, b"still here")
+        await until(lambda: ear_two.said(one.id) == [b"still here"])
 
 
 @pytest.mark.every_loop
@@ -618,6 +684,27 @@ async def test_a_link_without_free_files_goes_on_and_meets_others_when_there_are
             async with peer.stream:
                 await peer.meet()
                 await ear.joined(peer.link)
+
+
+async def test_a_link_at_the_loopback_whose_folder_is_closed_for_a_moment_is_met_afterwards(
+    directory: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[str] = []
+    scandir = os.scandir
+
+    def refuse_once(path: str) -> Any:
+        looks.append(path)
+        if len(looks) == 2:
+            raise PermissionError("closed for a moment")
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refuse_once)
+    wire = LocalWire(DOMAIN, directory=directory, loopback=True)
+    async with running(wire) as ear:
+        await until(lambda: len(looks) >= 3)
+        assert len(ear.warnings) == 1
+        async with running(LocalWire(DOMAIN, directory=directory, loopback=True)) as other:
+            await met(ear, other)
 
 
 # Opening and closing
@@ -661,6 +748,19 @@ async def test_a_file_or_a_symbolic_link_in_place_of_the_directory_is_refused(di
                 pass
 
 
+async def test_a_relative_directory_stays_where_it_was(
+    directory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(directory)
+    async with running(LocalWire(DOMAIN, directory="run")) as ear:
+        monkeypatch.chdir(tmp_path)
+        for _ in range(2):
+            async with running(LocalWire(DOMAIN, directory=str(Path(directory, "run")))) as other:
+                await met(ear, other)
+            await anyio.sleep(0.2)
+        assert files_in(str(tmp_path)) == []
+
+
 async def test_a_path_that_is_too_long_for_a_socket_is_told(directory: str) -> None:
     # The last one is too long for the name of a directory, too.
     for length in (20, 100):
@@ -688,13 +788,16 @@ async def test_the_environment_names_the_directory(
 
 
 @pytest.mark.every_loop
-async def test_all_that_waits_goes_out_when_a_link_closes(directory: str) -> None:
+@pytest.mark.parametrize("loopback", [False, True])
+async def test_all_that_waits_goes_out_when_a_link_closes(directory: str, loopback: bool) -> None:
     messages = [bytes(1_000_000) + str(number).encode() for number in range(5)]
-    async with running(LocalWire(DOMAIN, directory=directory)) as stays:
-        async with running(LocalWire(DOMAIN, directory=directory)) as ends:
+    async with running(LocalWire(DOMAIN, directory=directory, loopback=loopback)) as stays:
+        async with running(LocalWire(DOMAIN, directory=directory, loopback=loopback)) as ends:
             await met(stays, ends)
             for message in messages:
                 assert ends.wire.send(stays.id, message)
+            # This one comes too late to be read.
+            stays.wire.publish(LIVE, b"goodbye")
         await stays.left(ends.id)
         assert stays.said(ends.id) == messages
 

@@ -7,6 +7,7 @@ import socket
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from selectors import EVENT_READ, EVENT_WRITE
 from time import monotonic
 from typing import Any, Final
@@ -70,7 +71,9 @@ class Poll:
         if not hasattr(self._selector, "fileno"):
             thread = anyio.CapacityLimiter(1)
             while True:
-                await anyio.to_thread.run_sync(self.ready, _LOOK_AGAIN, abandon_on_cancel=True, limiter=thread)
+                # A socket that is closed meanwhile may end the wait with an error.
+                with suppress(OSError):
+                    await anyio.to_thread.run_sync(self.ready, _LOOK_AGAIN, abandon_on_cancel=True, limiter=thread)
                 serve()
         file: int = self._selector.fileno()
         loop: Any = anyio.lowlevel.current_token().native_token
@@ -194,7 +197,10 @@ class Connection:
             except BlockingIOError:
                 break
             except OSError:
-                # The other side reads no more. The reading finds the end, after all that the other has written before.
+                # The other side reads no more, or this machine has no memory, and the frame may have begun. The reading
+                # finds the end, after all that the other has written before.
+                with suppress(OSError):
+                    self.sock.shutdown(socket.SHUT_WR)
                 written = len(frame)
             self._begun = memoryview(frame)[written:] if written < len(frame) else b""
             most -= written
@@ -204,10 +210,17 @@ class Connection:
             self._watch()
 
     async def drain(self) -> None:
-        """Wait until all that waits has been written, instead of the poll."""
+        """Wait until all that waits has been written, instead of the poll; on the loopback, until it has been read."""
         while self.waits:
             await anyio.wait_writable(self.sock)
             self.flush()
+        if self.sock.family == socket.AF_INET:
+            # To close a port with unread bytes would reset it, and lose what the other side has not read.
+            with suppress(OSError):
+                self.sock.shutdown(socket.SHUT_WR)
+                await anyio.wait_readable(self.sock)
+                while self.sock.recv(READ_AT_ONCE):
+                    await anyio.wait_readable(self.sock)
 
     # Reading
 

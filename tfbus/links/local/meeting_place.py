@@ -46,18 +46,18 @@ def runtime_directory() -> Path:
     return Path(tempfile.gettempdir(), name)
 
 
-def make_private(directory: Path) -> None:
-    """Make a directory that only its user can enter.
+def make_private(directory: Path, *, parents: bool = False) -> None:
+    """Make a directory that only its user can enter, and perhaps its parents, as the system makes any.
 
     Raises
     ------
     PermissionError
         If it is another user's, or others can enter it, or it cannot be made.
     FileNotFoundError
-        If it has vanished again.
+        If it, or its parent, has vanished again.
     """
     try:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        directory.mkdir(mode=0o700, parents=parents, exist_ok=True)
         found = directory.lstat()
     except (PermissionError, FileExistsError, NotADirectoryError) as error:
         problem = f"cannot be made a directory ({error.strerror}): make it one with mode 700"
@@ -99,7 +99,8 @@ class MeetingPlace:
     """
 
     def __init__(self, domain: str, link: str, directory: str | None, loopback: bool | None) -> None:
-        self._root = runtime_directory() if directory is None else Path(directory)
+        # A program may go to another directory while its links look for others.
+        self._root = (runtime_directory() if directory is None else Path(directory)).absolute()
         self.loopback: bool = not hasattr(socket, "AF_UNIX") if loopback is None else loopback
         self._family = socket.AF_INET if self.loopback else socket.AF_UNIX
         kind = "loopback" if self.loopback else "unix"
@@ -130,8 +131,8 @@ class MeetingPlace:
         if not self.loopback and len(os.fsencode(path)) > LONGEST_PATH:
             problem = f"the path of a socket may have {LONGEST_PATH} bytes, and {path} is too long"
             raise OSError(f"{problem}: set TFBUS_RUNTIME_DIR to a shorter path")
-        for directory in (self._root, self._directory):
-            make_private(directory)
+        make_private(self._root, parents=True)
+        make_private(self._directory)
         listener = socket.socket(self._family)
         try:
             listener.setblocking(False)
@@ -139,9 +140,10 @@ class MeetingPlace:
             listener.listen(BACKLOG)
             if self.loopback:
                 # Another program may have the port of before, and know the key that was said there.
-                self.key = secrets.token_bytes(KEY)
+                key = secrets.token_bytes(KEY)
                 with os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w") as file:
-                    file.write(f"{listener.getsockname()[1]} {self.key.hex()}")
+                    file.write(f"{listener.getsockname()[1]} {key.hex()}")
+                self.key = key
         except OSError:
             listener.close()
             raise
