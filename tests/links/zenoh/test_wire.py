@@ -127,6 +127,30 @@ async def test_a_session_that_breaks_while_its_link_publishes_is_closed(address:
         tasks.cancel_scope.cancel()
 
 
+class Panic(BaseException):
+    """As a panic of zenoh comes to Python."""
+
+
+@pytest.mark.parametrize("error", [zenoh.ZError("broken"), Panic("broken")], ids=["error", "panic"])
+async def test_a_link_whose_session_breaks_in_a_call_says_so_and_connects_again(
+    error: BaseException, address: str, domain: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    look, broken = wire._Session.look, []
+
+    def break_once(session: Any, now: float) -> float | None:
+        if session._wire is one.wire and not broken:
+            broken.append(session)
+            raise error
+        return look(session, now)
+
+    async with ZenohRouter(address), listening(domain, connect=address) as one:
+        monkeypatch.setattr(wire._Session, "look", break_once)
+        await until(lambda: bool(one.warnings))
+        assert "connects again, because its session broke: broken" in str(one.warnings[0])
+        async with listening(domain, connect=address) as two:
+            await met(one, two)
+
+
 async def test_of_several_addresses_the_first_that_answers_is_taken(address: str, domain: str) -> None:
     dead = free_address()
     async with (

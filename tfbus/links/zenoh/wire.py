@@ -257,11 +257,14 @@ class ZenohWire(Wire):
 
     def _use(self, session: "_Session") -> None:
         """Look after a session until it breaks, or the wire is closed."""
-        while not self._stopped.is_set() and (pause := session.look(monotonic())) is not None:
-            if self.changed.wait(pause):
-                # zenoh tells of an event before the session knows of it.
-                self._stopped.wait(UNTIL_KNOWN)
-            self.changed.clear()
+        try:
+            while not self._stopped.is_set() and (pause := session.look(monotonic())) is not None:
+                if self.changed.wait(pause):
+                    # zenoh tells of an event before the session knows of it.
+                    self._stopped.wait(UNTIL_KNOWN)
+                self.changed.clear()
+        except BaseException as error:  # noqa: BLE001 - it may panic
+            self.warn(os_error(error, "the link connects again, because its session broke"))
 
     def _finish(self, session: "_Session") -> None:
         """Close a session, and wait for that; a second at most, unless the wire is closed."""
