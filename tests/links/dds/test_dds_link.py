@@ -209,6 +209,29 @@ async def test_a_message_that_is_read_after_the_end_of_its_writer_is_still_of_it
         assert end.bus.statistics().frames == 0
 
 
+async def test_all_messages_that_wait_at_the_end_of_their_writer_are_of_its_node(
+    domain_number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take_status, frames = DataReader.take_status, [f"frame{number}" for number in range(400)]
+    waits = Event()
+
+    def take_status_late(reader: Any) -> Any:
+        while waits.is_set() and reader.topic.name == "rt/tf" and reader.get_matched_publications():
+            time.sleep(0.01)
+        return take_status(reader)
+
+    monkeypatch.setattr(DataReader, "take_status", take_status_late)
+    async with joined(domain_number) as end:
+        with DdsNode(domain_number) as node:
+            node.writer("rt/tf")
+            await until(lambda: end.link.peers == (node.id,))
+            waits.set()
+            for number, frame in enumerate(frames, 1):
+                node.say(moving("map", frame, number))
+        await until(lambda: not end.link.peers)
+        assert end.heard == [moving("map", frame, number, authority=node.id) for number, frame in enumerate(frames, 1)]
+
+
 async def test_joints_the_time_and_a_description_come_from_topics_of_their_own(domain_number: int) -> None:
     states: list[Any] = []
     descriptions: list[str] = []

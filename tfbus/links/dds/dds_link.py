@@ -165,8 +165,9 @@ _KEPT = 100
 """So many of its own messages a writer repeats when they were lost, as tf2's broadcasters do."""
 _NODES = "ros_discovery_info"
 _OTHERS = "other topics"
+"""The sender of joint positions, the time, a description and odometry."""
 _UNKNOWN = "", ""
-"""The authority of joint positions and of the time."""
+"""The ids of a writer and its participant that the library does not tell."""
 _TYPES: dict[Other, Any] = {
     "joints": RawJointState,
     "clock": RawClock,
@@ -414,8 +415,10 @@ class DdsCarrier(RosCarrier):
         # The library's numbers have a sign here, and none in messages.
         found = {handle % 2**64: self._find(reader, handle) for handle in handles}
         if self._writers[number].items() - found.items():
-            # The messages of writers that have gone, because the library knows these no more.
-            take(reader)
+            # All messages of writers that have gone, because the library knows these no more.
+            for _ in range(_DEPTH // _AT_ONCE):
+                if not take(reader):
+                    break
         self._writers[number] = {handle: ids for handle, ids in found.items() if ids != _UNKNOWN}
         present = {participant for known in self._writers.values() for _, participant in known.values()}
         self._publishers.keep_only(present)
