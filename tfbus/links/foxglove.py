@@ -104,9 +104,8 @@ class FoxgloveServer(BusServer):
 
     async def _open(self) -> None:
         self._waker.bind()
-        # A cancellation must not lose a server that a thread has started.
-        with anyio.CancelScope(shield=True):
-            self._server = await anyio.to_thread.run_sync(self._start)
+        # It takes less than a millisecond. A thread would go on when asyncio cancels this task, and its server be lost.
+        self._server = self._start()
 
     async def _close(self) -> None:
         server, self._server = self._server, None
