@@ -202,14 +202,15 @@ async def test_while_nobody_has_subscribed_the_bus_is_not_listened_to(bus: Count
     assert server.address == ""
 
 
-async def test_stamps_that_foxglove_cannot_hold_are_counted(bus: Bus) -> None:
+async def test_stamps_and_names_that_foxglove_cannot_hold_are_counted(bus: Bus) -> None:
     end = 2**32 * SECOND
     bus.publish([static("map", "early", stamp=-1), static("map", "late", stamp=end), static("map", "ok", 1.0)])
+    bus.publish([static("map", "\ud800"), static("\udfff", "child")])
     bus.publish(static("map", "last", stamp=end - 1))
     async with FoxgloveServer(bus, 0) as server, application(server) as app:
         app.subscribe()
         assert [each[2] for each in await anyio.to_thread.run_sync(app.transforms)] == ["ok", "last"]
-        assert (server.sent, server.not_sent) == (2, 2)
+        assert (server.sent, server.not_sent) == (2, 4)
 
 
 async def test_a_port_that_is_taken_is_an_error(bus: Bus) -> None:
