@@ -129,6 +129,14 @@ async def test_others_see_the_name_of_the_program_of_a_link_and_its_process(doma
     assert names == {"", f"tfbus {Path(sys.argv[0]).name} [{os.getpid()}]"}
 
 
+async def test_a_program_whose_file_has_no_utf_8_for_its_name_can_join(
+    domain_number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["/opt/r\udcff.py"])
+    async with joined(domain_number) as end:
+        assert end.link.peers == ()
+
+
 async def test_a_link_is_a_node_with_its_publishers_until_it_ends(domain_number: int) -> None:
     told: list[Any] = []
     with DdsNode(domain_number) as node:
