@@ -5,7 +5,7 @@ import sys
 from importlib.util import find_spec
 
 import pytest
-from support.processes import new_domain
+from support.processes import new_dds_domain, new_domain
 
 BEGIN = """
 import asyncio, multiprocessing, os, sys, tempfile
@@ -147,6 +147,22 @@ anyio.run(main)
         *["RuntimeError this process was forked"] * 2,
         "RuntimeError this process was forked from one that uses zenoh",
     ]
+
+
+def test_a_child_cannot_join_a_domain_of_dds_that_its_parent_has_open() -> None:
+    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+    lines = said(f"""
+from tfbus.links.dds import DdsLink
+async def main():
+    async with DdsLink(Bus(), {new_dds_domain()}) as link:
+        async def enter():
+            with anyio.fail_after(10.0):
+                await DdsLink(Bus(), link.domain).__aenter__()
+        await anyio.to_thread.run_sync(in_a_process, lambda: tell(anyio.run, enter))
+anyio.run(main)
+""")
+    (line,) = lines
+    assert line.startswith("RuntimeError this process was forked from one that has the DDS domain ")
 
 
 @pytest.mark.thorough
