@@ -5,7 +5,7 @@ import sys
 from importlib.util import find_spec
 
 import pytest
-from support.processes import new_domain
+from support.processes import new_dds_domain, new_domain
 
 BEGIN = """
 import asyncio, multiprocessing, os, sys, tempfile
@@ -166,6 +166,22 @@ tell(anyio.run, enter, link)
         *["RuntimeError this process was forked since a link of the bus was made"] * 2,
         "did None",
     ]
+
+
+def test_a_child_cannot_join_a_domain_of_dds_that_its_parent_has_open() -> None:
+    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+    lines = said(f"""
+from tfbus.links.dds import DdsLink
+async def main():
+    async with DdsLink(Bus(), {new_dds_domain()}) as link:
+        async def enter():
+            with anyio.fail_after(10.0):
+                await DdsLink(Bus(), link.domain).__aenter__()
+        await anyio.to_thread.run_sync(in_a_process, lambda: tell(anyio.run, enter))
+anyio.run(main)
+""")
+    (line,) = lines
+    assert line.startswith("RuntimeError this process was forked from one that has the DDS domain ")
 
 
 @pytest.mark.thorough

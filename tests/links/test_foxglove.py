@@ -1,3 +1,4 @@
+import asyncio
 import json
 import random
 import socket
@@ -14,6 +15,7 @@ import pytest
 
 pytest.importorskip("foxglove", reason="serving Foxglove needs foxglove-sdk")
 
+import foxglove
 from support.processes import free_ports, is_free
 from support.samples import moving, static
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -200,14 +202,15 @@ async def test_while_nobody_has_subscribed_the_bus_is_not_listened_to(bus: Count
     assert server.address == ""
 
 
-async def test_stamps_that_foxglove_cannot_hold_are_counted(bus: Bus) -> None:
+async def test_stamps_and_names_that_foxglove_cannot_hold_are_counted(bus: Bus) -> None:
     end = 2**32 * SECOND
     bus.publish([static("map", "early", stamp=-1), static("map", "late", stamp=end), static("map", "ok", 1.0)])
+    bus.publish([static("map", "\ud800"), static("\udfff", "child")])
     bus.publish(static("map", "last", stamp=end - 1))
     async with FoxgloveServer(bus, 0) as server, application(server) as app:
         app.subscribe()
         assert [each[2] for each in await anyio.to_thread.run_sync(app.transforms)] == ["ok", "last"]
-        assert (server.sent, server.not_sent) == (2, 2)
+        assert (server.sent, server.not_sent) == (2, 4)
 
 
 async def test_a_port_that_is_taken_is_an_error(bus: Bus) -> None:
@@ -244,6 +247,34 @@ async def test_a_server_whose_task_is_cancelled_ends_too(bus: Bus) -> None:
             port = int(server.address.rpartition(":")[2])
             scope.cancel()
     await until(lambda: is_free(port))
+
+
+def test_a_server_that_asyncio_cancels_while_it_begins_listens_nowhere(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start, places = foxglove.start_server, list[tuple[str, int]]()
+
+    def start_server(*, host: str, **options: Any) -> Any:
+        server = start(host=host, **options)
+        places.append((host, server.port))
+        return server
+
+    def is_listening() -> bool:
+        with suppress(ConnectionRefusedError), socket.create_connection(places[0]):
+            return True
+        return False
+
+    async def cancel() -> None:
+        task = asyncio.create_task(FoxgloveServer(bus, 0).__aenter__())
+        await asyncio.sleep(0)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        await until(lambda: bool(places))
+        await until(lambda: not is_listening())
+
+    monkeypatch.setattr(foxglove, "start_server", start_server)
+    asyncio.run(cancel())
 
 
 async def test_a_server_is_entered_once_and_not_on_a_closed_bus(bus: Bus) -> None:

@@ -65,7 +65,7 @@ class FoxgloveServer(BusServer):
     sent : int
         Samples that were sent to the applications that had subscribed.
     not_sent : int
-        Samples whose stamp Foxglove cannot hold: before 1970, or after 2106.
+        Samples that Foxglove cannot hold: stamped before 1970 or after 2106, or with a name that has no UTF-8.
     refused : int
         Connections that were refused: of other pages, or beyond the 100th.
 
@@ -104,9 +104,8 @@ class FoxgloveServer(BusServer):
 
     async def _open(self) -> None:
         self._waker.bind()
-        # A cancellation must not lose a server that a thread has started.
-        with anyio.CancelScope(shield=True):
-            self._server = await anyio.to_thread.run_sync(self._start)
+        # It takes less than a millisecond. A thread would go on when asyncio cancels this task, and its server be lost.
+        self._server = self._start()
 
     async def _close(self) -> None:
         server, self._server = self._server, None
@@ -185,7 +184,7 @@ class FoxgloveServer(BusServer):
         self._statics.pop(frame, None)
 
     def _log(self, batch: Batch) -> None:
-        transforms = [_convert(sample) for sample in batch if 0 <= sample.stamp < _STAMP_END]
+        transforms = [transform for transform in map(_convert, batch) if transform is not None]
         self.not_sent += len(batch) - len(transforms)
         if transforms:
             self._channel.log(FrameTransforms(transforms=transforms), log_time=max(0, self.bus.clock.now()))
@@ -223,12 +222,18 @@ async def _pass_on(
     scope.cancel()
 
 
-def _convert(sample: TransformStamped) -> FrameTransform:
+def _convert(sample: TransformStamped) -> FrameTransform | None:
+    """A sample as Foxglove has it; None if Foxglove cannot hold its stamp or a name."""
     parent, child, stamp, (x, y, z, qx, qy, qz, qw), _, _ = sample._fields
-    return FrameTransform(
-        timestamp=Timestamp(*divmod(stamp, SECOND)),
-        parent_frame_id=parent,
-        child_frame_id=child,
-        translation=Vector3(x=x, y=y, z=z),
-        rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
-    )
+    if not 0 <= stamp < _STAMP_END:
+        return None
+    try:
+        return FrameTransform(
+            timestamp=Timestamp(*divmod(stamp, SECOND)),
+            parent_frame_id=parent,
+            child_frame_id=child,
+            translation=Vector3(x=x, y=y, z=z),
+            rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
+        )
+    except UnicodeEncodeError:
+        return None

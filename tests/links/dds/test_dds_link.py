@@ -129,6 +129,14 @@ async def test_others_see_the_name_of_the_program_of_a_link_and_its_process(doma
     assert names == {"", f"tfbus {Path(sys.argv[0]).name} [{os.getpid()}]"}
 
 
+async def test_a_program_whose_file_has_no_utf_8_for_its_name_can_join(
+    domain_number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["/opt/r\udcff.py"])
+    async with joined(domain_number) as end:
+        assert end.link.peers == ()
+
+
 async def test_a_link_is_a_node_with_its_publishers_until_it_ends(domain_number: int) -> None:
     told: list[Any] = []
     with DdsNode(domain_number) as node:
@@ -207,6 +215,29 @@ async def test_a_message_that_is_read_after_the_end_of_its_writer_is_still_of_it
         await until(lambda: not end.link.peers)
         assert end.heard == [static("map", "lidar", authority=node.id)]
         assert end.bus.statistics().frames == 0
+
+
+async def test_all_messages_that_wait_at_the_end_of_their_writer_are_of_its_node(
+    domain_number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take_status, frames = DataReader.take_status, [f"frame{number}" for number in range(400)]
+    waits = Event()
+
+    def take_status_late(reader: Any) -> Any:
+        while waits.is_set() and reader.topic.name == "rt/tf" and reader.get_matched_publications():
+            time.sleep(0.01)
+        return take_status(reader)
+
+    monkeypatch.setattr(DataReader, "take_status", take_status_late)
+    async with joined(domain_number) as end:
+        with DdsNode(domain_number) as node:
+            node.writer("rt/tf")
+            await until(lambda: end.link.peers == (node.id,))
+            waits.set()
+            for number, frame in enumerate(frames, 1):
+                node.say(moving("map", frame, number))
+        await until(lambda: not end.link.peers)
+        assert end.heard == [moving("map", frame, number, authority=node.id) for number, frame in enumerate(frames, 1)]
 
 
 async def test_joints_the_time_and_a_description_come_from_topics_of_their_own(domain_number: int) -> None:

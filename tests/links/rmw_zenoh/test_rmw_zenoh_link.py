@@ -1,3 +1,4 @@
+import asyncio
 import importlib.util
 import json
 import math
@@ -359,6 +360,32 @@ async def test_a_router_that_is_not_there_is_an_os_error() -> None:
     # Without the place in zenoh's own source.
     with Bus() as bus, pytest.raises(OSError, match=rf"no router of rmw_zenoh: [^/]*tcp/127.0.0.1:{port}[^/]*$"):
         await RmwZenohLink(bus, f"tcp/127.0.0.1:{port}", config={"connect/timeout_ms": 50}).__aenter__()
+
+
+def test_a_link_that_asyncio_cancels_while_it_connects_is_no_node_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    connecting, cancelled, sessions_opened = threading.Event(), threading.Event(), list[zenoh.Session]()
+    connect = zenoh.open
+
+    def connect_late(config: zenoh.Config) -> zenoh.Session:
+        connecting.set()
+        cancelled.wait(SECONDS)
+        sessions_opened.append(connect(config))
+        return sessions_opened[0]
+
+    async def cancel() -> None:
+        async with router() as address:
+            with Bus() as bus, monkeypatch.context() as patch:
+                patch.setattr(zenoh, "open", connect_late)
+                task = asyncio.create_task(RmwZenohLink(bus, address, DOMAIN).__aenter__())
+                await until(connecting.is_set)
+                task.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await task
+            cancelled.set()
+            await until(lambda: bool(sessions_opened))
+            await until(sessions_opened[0].is_closed)
+
+    asyncio.run(cancel())
 
 
 async def test_what_zenoh_does_not_take_is_told_and_not_counted_as_sent(

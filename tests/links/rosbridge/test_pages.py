@@ -132,6 +132,23 @@ async def test_a_page_may_have_messages_in_cbor_or_as_bytes_of_ros(bus: Bus, com
             assert samples_of(message) == [("map", "base", START + 7, QUARTER)]
 
 
+@pytest.mark.parametrize("compression", ["cbor", "cbor-raw"])
+async def test_a_name_that_has_no_utf_8_comes_in_json_or_is_left_out_and_ends_nothing(
+    bus: Bus, compression: str
+) -> None:
+    async with RosbridgeServer(bus, 0) as server, page_of(server) as page:
+        await page.ask("subscribe", topic="/tf", compression=compression)
+        assert await page.hear_all() == []
+        bus.publish([moving("map", "\ud800", START), moving("map", "base", START)])
+        message = (await page.hear())["msg"]
+        if compression == "cbor-raw":
+            assert [sample.child for sample in decode(message["bytes"]).samples if sample] == ["base"]
+        else:
+            assert [row["child_frame_id"] for row in message["transforms"]] == ["\ud800", "base"]
+        bus.publish(moving("map", "base", START + 1))
+        await page.hear()
+
+
 @in_simulated_time
 @pytest.mark.parametrize(("length", "kept"), [(0, [9]), (3, [7, 8, 9])])
 async def test_a_throttled_page_gets_the_newest_of_each_frame_or_as_many_as_it_has_room_for(
@@ -397,6 +414,14 @@ async def test_what_a_page_asks_for_has_bounds(bus: Bus) -> None:
         assert (first["id"], first["msg"]) == ("s100", "'/tf' has 100 subscriptions already")
         assert (second["id"], second["values"]) == ("g2", "a page has at most 1000 frames republished")
         assert server.requests_refused == 3
+
+
+async def test_republications_of_no_frame_have_a_bound_too(bus: Bus) -> None:
+    async with RosbridgeServer(bus, 0) as server, page_of(server) as page:
+        for number in range(1_001):
+            await begin(page, "action of ROS 2", f"g{number}", goal(source_frames=[]))
+        (refused,) = await page.hear_all()
+        assert (refused["id"], refused["values"]) == ("g1000", "a page has at most 1000 frames republished")
 
 
 async def test_the_service_names_a_hundred_topics_and_forgets_the_oldest(bus: Bus) -> None:

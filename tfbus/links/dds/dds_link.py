@@ -121,6 +121,7 @@ def configuration(discovery: Discovery | None = None, peers: Iterable[str] = (),
 class _SharedDomain:
     def __init__(self, number: int, config: str) -> None:
         self.config = config
+        self.process = os.getpid()
         self.users = 0
         self.domain = Domain(number, config)
 
@@ -137,6 +138,8 @@ def domain(number: int, config: str) -> Iterator[None]:
     ------
     OSError
         If it cannot be opened, or is open in this process with another configuration.
+    RuntimeError
+        If this process was forked from one in which it was open.
     """
     with _lock:
         shared = _open.get(number)
@@ -145,6 +148,11 @@ def domain(number: int, config: str) -> Iterator[None]:
                 shared = _open[number] = _SharedDomain(number, config)
             except DDSException as error:
                 raise OSError(f"cannot open the DDS domain {number}: {error}") from None
+        elif shared.process != os.getpid():
+            raise RuntimeError(
+                f"this process was forked from one that has the DDS domain {number} open, whose threads are not here: "
+                "start it with the method 'spawn' of multiprocessing"
+            )
         elif shared.config != config:
             raise OSError(f"the DDS domain {number} is open in this process with another configuration")
         shared.users += 1
@@ -165,8 +173,9 @@ _KEPT = 100
 """So many of its own messages a writer repeats when they were lost, as tf2's broadcasters do."""
 _NODES = "ros_discovery_info"
 _OTHERS = "other topics"
+"""The sender of joint positions, the time, a description and odometry."""
 _UNKNOWN = "", ""
-"""The authority of joint positions and of the time."""
+"""The ids of a writer and its participant that the library does not tell."""
 _TYPES: dict[Other, Any] = {
     "joints": RawJointState,
     "clock": RawClock,
@@ -414,8 +423,10 @@ class DdsCarrier(RosCarrier):
         # The library's numbers have a sign here, and none in messages.
         found = {handle % 2**64: self._find(reader, handle) for handle in handles}
         if self._writers[number].items() - found.items():
-            # The messages of writers that have gone, because the library knows these no more.
-            take(reader)
+            # All messages of writers that have gone, because the library knows these no more.
+            for _ in range(_DEPTH // _AT_ONCE):
+                if not take(reader):
+                    break
         self._writers[number] = {handle: ids for handle, ids in found.items() if ids != _UNKNOWN}
         present = {participant for known in self._writers.values() for _, participant in known.values()}
         self._publishers.keep_only(present)
@@ -475,7 +486,8 @@ class DdsLink(RosLink):
     OSError
         On entering, if the domain cannot be joined, or is open in this process with other settings.
     BusClosedError, RuntimeError
-        On entering, if the bus is closed; if it belongs to another thread, or the link was entered before.
+        On entering, if the bus is closed; if it belongs to another thread, the link was entered before, or the process
+        was forked from one that has the domain open.
     ImportError
         On import, without the extra: ``pip install "tfbus[dds]"``.
 

@@ -75,7 +75,9 @@ def join(number: int, stack: ExitStack) -> DomainParticipant:
 
 def program() -> str:
     """The name of this program and the number of its process, which tools of DDS show."""
-    return f"tfbus {Path(sys.argv[0]).name[:_LONGEST_PROGRAM] or 'python'} [{os.getpid()}]"
+    # DDS takes UTF-8 only, and a file may have any name.
+    name = Path(sys.argv[0]).name.encode(errors="replace").decode()
+    return f"tfbus {name[:_LONGEST_PROGRAM] or 'python'} [{os.getpid()}]"
 
 
 def read(reader: BuiltinDataReader) -> list[Any]:

@@ -144,6 +144,7 @@ class RmwZenohCarrier(RosCarrier):
         self._node = node
         self._config = config
         self._session: zenoh.Session | None = None
+        self._ended = False
         self._close_at_exit: weakref.finalize[..., RmwZenohCarrier] | None = None
         self._declared: list[Any] = []
         self._publishers: dict[bool, zenoh.Publisher | zenoh.ext.AdvancedPublisher] = {}
@@ -159,6 +160,10 @@ class RmwZenohCarrier(RosCarrier):
     def _join(self) -> None:
         use_zenoh()
         session = self._session = zenoh.open(self._config)
+        if self._ended:
+            # asyncio has cancelled the task that waits for this thread.
+            session.close()
+            return
         # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
         self._close_at_exit = weakref.finalize(self, close_session, session.close)
         name = str(session.zid())
@@ -235,6 +240,7 @@ class RmwZenohCarrier(RosCarrier):
 
     async def close(self) -> None:
         """Close the session, or give up waiting for that."""
+        self._ended = True
         session, self._session = self._session, None
         self._publishers.clear()
         if self._close_at_exit is not None:

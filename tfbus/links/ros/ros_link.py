@@ -28,7 +28,7 @@ from tfbus.tf_message import Decoded, MalformedMessageError, decode, decode_in_p
 MAX_SIZE = 2**22
 """The largest message that is received, in bytes."""
 MAX_OTHER_SIZE = 2**15
-"""The largest message of joints or of the time, in bytes."""
+"""The largest message of joints, of odometry or of the time, in bytes."""
 AT_ONCE = 2**13
 """A message of transforms beyond so many bytes or characters is read in parts."""
 PART = 40

@@ -287,7 +287,13 @@ class _Page:
                 seconds, nanoseconds = divmod(self._server.bus.clock.now(), SECOND)
                 held = [transform for transform in transforms if refusal(transform) is None]
                 envelope["msg"] = {"secs": seconds, "nsecs": nanoseconds, "bytes": encode(held)}
-            await self._out.send(cbor2.dumps(envelope))
+            try:
+                data = cbor2.dumps(envelope)
+            except UnicodeEncodeError:
+                # A name with half of a surrogate pair, which only JSON can write.
+                await self._send(envelope)
+            else:
+                await self._out.send(data)
 
     async def _send_transforms(self, topic: str, transforms: Sequence[TransformStamped]) -> None:
         await self._send_message(topic, _message(transforms), transforms)
@@ -523,7 +529,8 @@ class _Page:
                 server._dropped += batches.dropped
 
     def _begin(self, key: str, republication: _Republication, say: Say) -> None:
-        self._start(key, len(republication.sources), lambda: self._republish(republication, say))
+        # One without frames takes a task, too.
+        self._start(key, max(1, len(republication.sources)), lambda: self._republish(republication, say))
 
     async def _republish(self, republication: _Republication, say: Say) -> None:
         newest: dict[str, TransformStamped] = {}
