@@ -135,7 +135,8 @@ class Panic(BaseException):
 async def test_a_link_whose_session_breaks_in_a_call_says_so_and_connects_again(
     error: BaseException, address: str, domain: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    look, broken = wire._Session.look, []
+    look = wire._Session.look
+    broken: list[Any] = []
 
     def break_once(session: Any, now: float) -> float | None:
         if session._wire is one.wire and not broken:
