@@ -230,7 +230,7 @@ class DdsCarrier(RosCarrier):
         self._publishers = Publishers(self)
         self._participants: BuiltinDataReader | None = None
         # The ids of the writers that each reader is matched with and of their participants, by the library's numbers.
-        self._writers: defaultdict[int, dict[int, tuple[str, str]]] = defaultdict(dict)
+        self._writers: defaultdict[DataReader[Any], dict[int, tuple[str, str]]] = defaultdict(dict)
         self._greetings: dict[int, Greeting] = {}
         self._behind: dict[DataReader[Any], int] = {}
         self._present: set[str] = set()
@@ -272,7 +272,7 @@ class DdsCarrier(RosCarrier):
                 if not static:
                     self._greetings[number] = Greeting(partial(DataReader, participant, topics[name], _SECOND))
                     self._open.callback(self._greetings[number].close)
-                take = partial(self._take, static, number)
+                take = partial(self._take, static)
                 thread.watch(reader, take, partial(self._match, number, take))
             self._introduce(participant)
             thread.start()
@@ -329,12 +329,12 @@ class DdsCarrier(RosCarrier):
 
     # The thread of the readers calls the methods below.
 
-    def _take(self, static: bool, number: int, reader: DataReader[RawTFMessage]) -> bool:
-        return self._take_each(reader, partial(self._take_transforms, static, number, reader))
+    def _take(self, static: bool, reader: DataReader[RawTFMessage]) -> bool:
+        return self._take_each(reader, partial(self._take_transforms, static, reader))
 
-    def _take_transforms(self, static: bool, number: int, reader: DataReader[RawTFMessage], message: Any) -> None:
+    def _take_transforms(self, static: bool, reader: DataReader[RawTFMessage], message: Any) -> None:
         handle = message.sample_info.publication_handle
-        publisher, participant = self._writers[number].get(handle) or self._find(reader, handle)
+        publisher, participant = self._writers[reader].get(handle) or self._find(reader, handle)
         if self.settings.authority is None:
             self._publishers.message(publisher, participant, message.payload, static)
         else:
@@ -422,12 +422,12 @@ class DdsCarrier(RosCarrier):
             return RETRY
         # The library's numbers have a sign here, and none in messages.
         found = {handle % 2**64: self._find(reader, handle) for handle in handles}
-        if self._writers[number].items() - found.items():
+        if self._writers[reader].items() - found.items():
             # All messages of writers that have gone, because the library knows these no more.
             for _ in range(_DEPTH // _AT_ONCE):
                 if not take(reader):
                     break
-        self._writers[number] = {handle: ids for handle, ids in found.items() if ids != _UNKNOWN}
+        self._writers[reader] = {handle: ids for handle, ids in found.items() if ids != _UNKNOWN}
         present = {participant for known in self._writers.values() for _, participant in known.values()}
         self._publishers.keep_only(present)
         for participant in sorted(present - self._present):
@@ -436,7 +436,7 @@ class DdsCarrier(RosCarrier):
             self._receive(Received(participant, Left()))
         self._present = present
         greeting = self._greetings.get(number)
-        return None if greeting is None else greeting.update({writer for writer, _ in self._writers[number].values()})
+        return None if greeting is None else greeting.update({writer for writer, _ in self._writers[reader].values()})
 
     def _failed(self, error: Exception) -> None:
         """Count and tell an error that has kept messages from being read."""
