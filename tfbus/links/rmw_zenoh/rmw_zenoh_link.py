@@ -162,7 +162,7 @@ class RmwZenohCarrier(RosCarrier):
         session = self._session = zenoh.open(self._config)
         if self._ended:
             # asyncio has cancelled the task that waits for this thread.
-            session.close()
+            close_session(session.close)
             return
         # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
         self._close_at_exit = weakref.finalize(self, close_session, session.close)
