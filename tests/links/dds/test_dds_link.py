@@ -193,19 +193,24 @@ async def test_what_waits_for_the_name_of_its_node_comes_before_the_end_of_its_p
             end.heard.clear()
 
 
+def call_after_the_writers(method: str, topic: str, monkeypatch: pytest.MonkeyPatch) -> Event:
+    """While the event is set, have readers of a topic call a method of theirs only when their writers have gone."""
+    called, waits = getattr(DataReader, method), Event()
+
+    def call_late(reader: Any, *arguments: Any, **options: Any) -> Any:
+        while waits.is_set() and reader.topic.name == topic and reader.get_matched_publications():
+            time.sleep(0.01)
+        return called(reader, *arguments, **options)
+
+    monkeypatch.setattr(DataReader, method, call_late)
+    return waits
+
+
 @pytest.mark.parametrize("late", ["take", "take_status"])
 async def test_a_message_that_is_read_after_the_end_of_its_writer_is_still_of_its_node(
     late: str, domain_number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    called = getattr(DataReader, late)
-    waits = Event()
-
-    def call_late(reader: Any, *arguments: Any, **options: Any) -> Any:
-        while waits.is_set() and reader.topic.name == "rt/tf_static" and reader.get_matched_publications():
-            time.sleep(0.01)
-        return called(reader, *arguments, **options)
-
-    monkeypatch.setattr(DataReader, late, call_late)
+    waits = call_after_the_writers(late, "rt/tf_static", monkeypatch)
     async with joined(domain_number, drop_lost=True) as end:
         with DdsNode(domain_number) as node:
             node.writer("rt/tf_static")
@@ -220,15 +225,8 @@ async def test_a_message_that_is_read_after_the_end_of_its_writer_is_still_of_it
 async def test_all_messages_that_wait_at_the_end_of_their_writer_are_of_its_node(
     domain_number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    take_status, frames = DataReader.take_status, [f"frame{number}" for number in range(400)]
-    waits = Event()
-
-    def take_status_late(reader: Any) -> Any:
-        while waits.is_set() and reader.topic.name == "rt/tf" and reader.get_matched_publications():
-            time.sleep(0.01)
-        return take_status(reader)
-
-    monkeypatch.setattr(DataReader, "take_status", take_status_late)
+    frames = [f"frame{number}" for number in range(400)]
+    waits = call_after_the_writers("take_status", "rt/tf", monkeypatch)
     async with joined(domain_number) as end:
         with DdsNode(domain_number) as node:
             node.writer("rt/tf")
